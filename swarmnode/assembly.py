@@ -49,22 +49,22 @@ class Assembly:
 
 
 def load_identity(store: Store, rng: random.Random) -> Identity:
-    """Return the lasting identity in the store, and create it at the first start."""
+    """Return the node's permanent identity from the store; at the first start create and store it."""
     seed = store.get_note("identity")
     if seed is None or len(seed) != 32:
         if store.origin != "new":
-            _log.warn("the data store has lost the node's identity: the node has a new one now")
+            _log.warn("the data store has lost the node's identity: the node has a new identity now")
         seed = rng.randbytes(32)
         store.set_note("identity", seed)
     return Identity(seed)
 
 
 def check_team(settings: Settings) -> None:
-    """Raise ``BadSetting`` if the settings have no team, or two."""
+    """Raise ``BadSetting`` unless the settings have either a membership or a team key."""
     node = settings.node
     if not node.membership and not node.team_key:
         problem = "is missing: this node has no team"
-        remedy = "create a team by swarm init, join one by swarm join CODE, or set team_key to a secret (open team)"
+        remedy = "create a team (swarm init), join a team (swarm join CODE), or set team_key to a secret (open team)"
         raise BadSetting(settings.origin, "[node] membership", problem, remedy)
     if node.membership and node.team_key:
         problem = "is set in addition to a membership: a team is either closed or open"
@@ -100,16 +100,16 @@ def assemble_node(settings: Settings, dependencies: Dependencies) -> Assembly:
 
 
 def _check_robot(settings: Settings) -> None:
-    """Raise ``BadSetting`` if there is an agent or a part without a robot."""
+    """Raise ``BadSetting`` if the settings have an agent or driver parts, but no robot."""
     if settings.agent.module and not settings.driver.kind:
         problem = f"is {settings.agent.module!r}, but there is no robot"
-        raise BadSetting(settings.origin, "[agent] module", problem, "set [driver] kind, or leave the agent out")
+        raise BadSetting(settings.origin, "[agent] module", problem, "set [driver] kind, or remove [agent] module")
     if settings.driver.parts and not settings.driver.kind:
         raise BadSetting(settings.origin, "[driver] parts", "are set, but there is no robot", "set [driver] kind")
 
 
 def _make_device(settings: Settings) -> Device:
-    """Return the device with its own settings, and kind and capabilities of its driver as defaults."""
+    """Return the device as set in ``settings``; its driver provides the default kind and capabilities."""
     node, wanted = settings.node, settings.driver
     kind, capabilities = node.kind, dict(node.capabilities)
     if wanted.kind:
@@ -130,7 +130,7 @@ def _make_device(settings: Settings) -> Device:
 
 
 def _make_driver(settings: Settings, dependencies: Dependencies) -> Driver | None:
-    """Return the driver of the robot, not yet connected; None without a robot."""
+    """Return the driver of the robot, not yet connected, or None if the settings have no robot."""
     wanted = settings.driver
     if not wanted.kind:
         return None
@@ -140,7 +140,7 @@ def _make_driver(settings: Settings, dependencies: Dependencies) -> Driver | Non
 
 
 def _make_node(device: Device, settings: Settings, dependencies: Dependencies) -> SwarmNode:
-    """Return the node of ``device``, a member of its team."""
+    """Return the node of ``device``, with the identity and the secret of its team."""
     team = _load_team(dependencies)
     known = [] if team is None else team.membership.known_nodes
     node = SwarmNode(
@@ -166,7 +166,7 @@ def _make_node(device: Device, settings: Settings, dependencies: Dependencies) -
 
 
 def _expose_methods(node: SwarmNode, settings: Settings, driver: Driver | None) -> None:
-    """Expose diagnostics, changes of settings, and the emergency stop."""
+    """Let peers query the node's diagnostics, change its settings, and stop its robot."""
     expose_diagnostics(node)
     tuning = expose_tuning(node, settings, {} if driver is None else driver.description.capabilities)
     filming: object = driver
@@ -178,7 +178,7 @@ def _expose_methods(node: SwarmNode, settings: Settings, driver: Driver | None) 
 def _make_agent(
     node: SwarmNode, settings: Settings, driver: Driver | None, dependencies: Dependencies
 ) -> Service | None:
-    """Return the agent of the device; None if the settings have none."""
+    """Return the agent of the device, or None if the settings have no agent."""
     if not settings.agent.module or driver is None:
         return None
     agent = load_agent(settings.agent.module)(node, driver, dependencies.clock, dependencies.rng)
@@ -191,7 +191,7 @@ def _make_agent(
 
 
 def _load_team(dependencies: Dependencies) -> Team | None:
-    """Return the closed team of the node; None, without importing its modules, in an open team."""
+    """Return the closed team of the node; in an open team return None and import no modules for closed teams."""
     if dependencies.membership is None:
         return None
     from middleware.admission.team import Team
@@ -206,7 +206,7 @@ def _make_camera_knob(driver: Filming) -> TunableSetting:
 
 
 def _enable_deployment(node: SwarmNode, settings: Settings, dependencies: Dependencies) -> None:
-    """Let the node run modules that its operators push; the modules for this are imported only if it is allowed."""
+    """Let the node run modules that its operators push; the code for this is imported here, to save memory."""
     from middleware.deployment.deployment import Author, Deployment
     from middleware.deployment.module_store import MemoryModuleStore
     from middleware.deployment.process_channel import ProcessChannel

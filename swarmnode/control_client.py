@@ -18,16 +18,17 @@ class Rejection(Exception):
 
 
 class ControlClient:
-    """A client of one node's control socket; raises ``NoControl`` if there is none on this machine."""
+    """A client of one node's control socket; raises ``NoControl`` if no such node runs on this machine."""
 
     def __init__(self, node: str | None, ask: SendRequest) -> None:
         self._path: Path = find_socket(node)
         self._ask = ask
 
     def get_records(self, key: str, concern: str = "majority") -> list[Record]:
-        """Return the records of the network under the key of a text; the ``concern`` ``fast`` uses the first reply.
+        """Return the network's records under the hash of the text ``key``.
 
-        The node has verified the signatures; they are not sent over the socket.  Raises ``Rejection``.
+        The ``concern`` ``fast`` uses the first reply; ``majority`` waits for a majority of the replicas.  The node has
+        verified the signatures; they are not sent over the socket.  Raises ``Rejection``.
         """
         answer = self._request("dht get", key=key, concern=concern)
         if not isinstance(answer, list):
@@ -42,7 +43,7 @@ class ControlClient:
         return parse_devices([_parse_record(DEVICES, each) for each in answer])
 
     def put(self, key: str, name: str, value: bytes) -> int:
-        """Store ``value`` in the node's slot; returns the number of replicas that stored it.  Raises ``Rejection``."""
+        """Store ``value`` in the node's slot ``name``; return the number of its replicas.  Raises ``Rejection``."""
         given = {"base64": base64.b64encode(value).decode()}
         return int(self._request("dht put", key=key, name=name, value=given)["replicas"])
 
@@ -51,7 +52,7 @@ class ControlClient:
         return self._request("rpc", node=address, method=method, arguments=list(arguments), changes=True)
 
     def list_links(self) -> list[dict[str, Any]]:
-        """Return the links to the node's peers, with the round-trip times of some probes; raises ``Rejection``."""
+        """Return the links to the node's peers, with the round-trip times of recent probes; raises ``Rejection``."""
         answer = self._request("links")
         if not isinstance(answer, list):
             raise Rejection("the node's reply about its links is not a list; update the node")

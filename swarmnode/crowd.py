@@ -1,6 +1,6 @@
 """Simulation of hundreds of agents, each with a real node and driver and a robot in the simulator (``swarm crowd``).
 
-The nodes are real ones, with in-memory implementations of clock, network and store.
+The nodes run their production code with in-memory implementations of clock, network and store.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from swarmnode.service import NodeService
 from swarmnode.simulated_team import LAN
 
 TASK_NODE = "desk"
-"""Name of the node without a robot, which assigns the task and is the bootstrap node of all others."""
+"""Name of the first node, which has no robot and assigns the task."""
 TEAM_KEY = "of a crowd that never leaves one process"
 JOIN_INTERVAL_S = 0.1
-"""Seconds between the starts of two nodes."""
+"""Seconds between the starts of consecutive nodes."""
 SETTLE_S = 2.0
 CAMERA_FPS = 5.0
 PORT = 7000
@@ -41,7 +41,7 @@ TASK_ID = "search"
 class CrowdTeam(Simulation):
     """``agents`` nodes with the first robots of a crowd on ``scene``, and one node without a robot.
 
-    Node, agent, driver and detection are the real ones; the team is open.  A seed reproduces a run exactly.
+    Node, agent, driver and detection run their production code; the team is open.  Runs with one seed are identical.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class CrowdTeam(Simulation):
         self.clock.advance(SETTLE_S)
 
     def address(self, place: int) -> Address:
-        """Return the address of the node ``place``; each node has a separate machine."""
+        """Return the address of the node number ``place``; each node has a separate machine."""
         return Address(f"10.{place >> 16}.{place >> 8 & 255}.{place & 255}", PORT)
 
     def assign(self) -> None:
@@ -88,14 +88,14 @@ class CrowdTeam(Simulation):
         return {name: AgentStatus(me.cost, named.get(me.assigned, "")) for name, me in every.items()}
 
     def find_finisher(self) -> str | None:
-        """Return the name of the agent that ended the task, None while it is open."""
+        """Return the name of the agent that ended the task, or None if the task is open."""
         if self._task_watch is None or self._task is None:
             return None
         outcome = find_outcome(self._task, self._task_watch.records)
         return None if outcome is None else outcome.by
 
     def stop(self) -> None:
-        """Stop all nodes at once, without leaving messages."""
+        """Stop all nodes immediately; they do not tell their peers that they leave."""
         for service in self.services.values():
             service.vanish()
         self.simulator.stop()
@@ -109,7 +109,7 @@ class CrowdTeam(Simulation):
         mapping: dict[str, Any] = {"node": node}
         rng = random.Random(f"{self.seed}/{name}")
         if number:
-            # Each joins through a random earlier node, so the load on a single bootstrap node is not measured.
+            # Each node joins through a random earlier node, so no single bootstrap node limits the result.
             node["known_nodes"] = [str(self.address(rng.randrange(number)))]
             mapping["agent"] = {"module": "search"}
             mapping["driver"] = {"kind": "sim", "options": {"robot": name, "camera_fps": self._fps}}

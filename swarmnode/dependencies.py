@@ -1,4 +1,4 @@
-"""Dependencies of a node on its environment."""
+"""The parts of the environment that a node depends on."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """``swarm deploy``: push modules to a team, roll them back and show their state.
 
-The node on this machine signs each pushed module, and stores it in its slot: its key is the operator's key.
+The node on this machine signs each pushed module and stores it under the node's key.  Other nodes run the module if
+their settings list this node's key in ``[deployment] operators``.
 """
 
 from __future__ import annotations
@@ -40,13 +41,13 @@ SOURCE_SLOT = "source"
 def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     common = argparse.ArgumentParser(add_help=False)
-    common.add_argument("--node", metavar="NAME", help="node on this machine, if several run")
+    common.add_argument("--node", metavar="NAME", help="name of the node, if several run on this machine")
     common.add_argument("--json", action="store_true", help="print JSON, on one line")
     main_parser = argparse.ArgumentParser(
         prog="swarm deploy",
         description="Push a strategy or a behaviour to the running team, signed by the node on this machine.",
-        epilog="A node runs a module only if its [deployment] settings allow it, and list the module's name and this "
-        "node's key as an operator.  Example: swarm deploy push follow.py --name follow --kind behaviour",
+        epilog="A node runs a module only if [deployment] in its settings allows deployment, lists the module's name, "
+        "and lists this node's key in operators.  Example: swarm deploy push follow.py --name follow --kind behaviour",
     )
     verbs = main_parser.add_subparsers(dest="verb", required=True, metavar="VERB")
 
@@ -59,11 +60,11 @@ def make_parser() -> argparse.ArgumentParser:
     push.add_argument("file", metavar="FILE", help="Python source, one file")
     push.add_argument("--name", required=True, help=f"name of the module; tasks refer to it as {PREFIX}NAME")
     push.add_argument("--kind", required=True, choices=KINDS, help="kind of the module")
-    push.add_argument("--version", type=int, metavar="N", help="version, higher than the last one (default: next)")
+    push.add_argument("--version", type=int, metavar="N", help="version number (default: the newest plus 1)")
     back = verb("rollback", "Roll a module back to the previous version.", " nearest-left")
     back.add_argument("name", metavar="NAME", help="name of the module")
     verb("status", "Show the pushed modules and the devices that run them.", " --json")
-    verb("keys", "Print the public key of each device, as needed in [deployment] operators.", "")
+    verb("keys", "Print the public key of each device, for the setting [deployment] operators.", "")
     return main_parser
 
 
@@ -86,7 +87,7 @@ def _push(options: argparse.Namespace, ask: SendRequest) -> Answer:
     if not re.fullmatch(NAME_PATTERN, options.name, re.ASCII):
         raise InvalidCommand(f"--name {options.name!r} does not match {NAME_PATTERN}")
     if not 0 < len(source) <= MAX_SOURCE_BYTES:
-        raise InvalidCommand(f"{options.file} has {len(source)} bytes; a module has 1 to {MAX_SOURCE_BYTES}")
+        raise InvalidCommand(f"{options.file} has {len(source)} bytes; a module must have 1 to {MAX_SOURCE_BYTES}")
     try:
         compile_source(source, options.name)
     except Undeployable as error:

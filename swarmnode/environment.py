@@ -67,7 +67,7 @@ def make_dependencies(settings: Settings, reactor: Any) -> Dependencies:
 
 
 def make_network_factory(node: NodeSettings, reactor: Any, rng: random.Random) -> Callable[[], Network]:
-    """Return the factory of the node's UDP port, with tunnels if it has any."""
+    """Return the factory of the node's network: its UDP port, and its tunnels if the settings have any."""
     from middleware.entangled.network.udp import UdpNetwork
 
     return add_tunnels(node, partial(UdpNetwork, reactor, node.host, node.port), reactor, rng, os.environ)

@@ -43,21 +43,21 @@ class TeamStage:
         self._client = client
 
     def devices(self) -> list[Device]:
-        """Return the present devices."""
+        """Return the devices that are online."""
         return [device for device, _ in self._client.list_devices()]
 
     def assign(self, task: str) -> str:
-        """Publish a task through the first device that permits it."""
+        """Publish a task through the first device that accepts the request; return the id of the task."""
         refusals = []
         for device in self.devices():
             try:
                 return str(self._client.call(device.address, ASSIGN_METHOD, task))
             except Rejection as error:
                 refusals.append(f"{device.name}: {error}")
-        raise Rejection("no device publishes the task: " + ("; ".join(refusals) or "no device is present"))
+        raise Rejection("no device accepts the task: " + ("; ".join(refusals) or "no device is online"))
 
     def inject(self, device: Device, fault: Fault) -> float:
-        """Order the fault at the device."""
+        """Request the fault from the device; return the delay in seconds until it begins."""
         try:
             return parse_delay(
                 self._client.call(device.address, CAUSE_METHOD, fault.kind, fault.seconds, fault.amount or None)
@@ -71,7 +71,7 @@ class TeamStage:
         return task is not None and find_outcome(task, self._client.get_records(f"task/{task_id}", "fast")) is not None
 
     def describe_faults(self, device: Device) -> str:
-        """Describe the faults that the device supports, and the active ones."""
+        """Describe the faults that the device supports, and its active faults."""
         try:
             answer = self._client.call(device.address, LIST_METHOD)
         except Rejection as error:
@@ -83,7 +83,7 @@ class TeamStage:
 def _explain(error: Rejection) -> str:
     # Replace the error for an unknown method by an explanation.
     is_unknown = "method" in str(error)
-    return 'it does not allow faults; set "allow = true" in [faults] of its settings' if is_unknown else str(error)
+    return 'fault injection is off; set "allow = true" in [faults] of its settings' if is_unknown else str(error)
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -97,12 +97,12 @@ def make_parser() -> argparse.ArgumentParser:
         "swarm chaos run FILE: run a scenario; see swarm chaos run --help.\n\n"
         "example: swarm chaos executing radio --seconds 10",
     )
-    chaos.add_argument("device", metavar="DEVICE", help='name of the device, "executing" or "any"')
+    chaos.add_argument("device", metavar="DEVICE", help='name, "executing" (a device that acts on a task) or "any"')
     chaos.add_argument("kind", metavar="KIND", help="kind of fault")
     chaos.add_argument(
         "--seconds", type=float, default=DEFAULT_S, help=f"duration, {MIN_S:g} to {MAX_S:g} s (default: {DEFAULT_S:g})"
     )
-    chaos.add_argument("--amount", type=float, help="amount of delay, loss, skew or battery")
+    chaos.add_argument("--amount", type=float, help="amount, for the kinds delay, loss, skew and battery")
     _add_common_arguments(chaos)
     return chaos
 
@@ -111,18 +111,18 @@ def make_scenario_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line for a scenario."""
     run = argparse.ArgumentParser(
         prog="swarm chaos run",
-        description="Run a scenario: faults and their times from a file.",
+        description="Run a scenario: a file that lists faults and their times.",
         epilog="Example: swarm chaos run examples/scenarios/takeover.toml --rehearse --seed 7",
     )
     run.add_argument("file", metavar="FILE", type=Path, help="scenario, such as examples/scenarios/takeover.toml")
-    run.add_argument("--rehearse", action="store_true", help="run it with a simulated team; a seed repeats a run")
+    run.add_argument("--rehearse", action="store_true", help="use a simulated team; equal seeds give equal runs")
     _add_common_arguments(run)
     return run
 
 
 def _add_common_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--seed", type=int, help='selects the devices for "any" (default: the seed of the scenario)')
-    parser.add_argument("--node", metavar="NAME", help="node on this machine, if several run")
+    parser.add_argument("--seed", type=int, help='seed for the choice of "any" device (default: that of the scenario)')
+    parser.add_argument("--node", metavar="NAME", help="name of the node, if several run on this machine")
 
 
 def main(
@@ -132,7 +132,7 @@ def main(
     seconds: Callable[[], float] = time.monotonic,
     wait: Callable[[float], None] = time.sleep,
 ) -> int:
-    """Run the command; returns 0, 1 if a takeover was late or a device refused, 2 if the command is wrong."""
+    """Run the command; returns 0, 1 if a takeover was late or a device rejected a fault, 2 if the command is wrong."""
     out = out or sys.stdout
     arguments = list(sys.argv[1:] if words is None else words)
 
@@ -149,7 +149,7 @@ def main(
         elif arguments[:1] == [LIST]:
             listing = argparse.ArgumentParser(
                 prog="swarm chaos list",
-                description="List the faults that each device supports, and the active ones.",
+                description="List the faults that each device supports, and its active faults.",
                 epilog="Example: swarm chaos list --node dog1",
             )
             _add_common_arguments(listing)

@@ -46,16 +46,16 @@ MAX_PHONES = 8
 PICTURE_TIMEOUT_S = 1.0
 """Seconds of silence after which a phone is considered gone."""
 FIRST_PICTURE_TIMEOUT_S = 5.0
-"""Seconds until the first picture: the browser may have to ask the visitor for the camera."""
+"""Seconds to wait for the first picture: the browser may first ask the visitor to allow the camera."""
 IDLE_FPS = 5.0
-"""Frame rate without a task: enough to be considered present, and it saves the phone's battery."""
+"""Frame rate of a phone without a task: it shows that the phone is present, and saves the phone's battery."""
 PICTURE_BURST, PICTURES_PER_S = 20.0, 15.0
 """Rate limit of pictures: burst, and pictures per second."""
 JOIN_BURST, JOINS_PER_S = 8.0, 1.0
 POSITION_INTERVAL_S = 1.0
 """Minimum seconds between two published positions."""
 POSITION_DECIMALS: Mapping[str, int] = {"lat": 5, "lon": 5, "accuracy": 0}
-"""Published fields of the position and their decimals: about a metre."""
+"""Published fields of the position, each with its number of decimals: a precision of about a metre."""
 HASH_PERSON = b"phone"
 
 
@@ -68,7 +68,7 @@ def check_picture(jpeg: bytes) -> tuple[int, int]:
     """Return width and height of a picture in pixels; raises ``Refusal`` 400 for an unsupported picture."""
     size = read_size(jpeg)
     if size is None or max(size) > MAX_SIDE_PX:
-        problem = "it is not a supported JPEG picture" if jpeg else "it is missing or empty"
+        problem = "the picture is not a supported JPEG" if jpeg else "the picture is missing or empty"
         raise Refusal("body", problem, f"send a complete JPEG of at most {MAX_SIDE_PX} pixels a side")
     return size
 
@@ -76,8 +76,8 @@ def check_picture(jpeg: bytes) -> tuple[int, int]:
 class Gateway:
     """The phones that take part through ``node``.
 
-    ``dependencies`` returns those of one more node; ``others`` returns the present devices.  When a phone leaves or
-    falls silent, its node still runs and releases its lease, so another device continues at once.
+    ``dependencies`` returns the dependencies of a further node; ``others`` returns the devices that are online.  When a
+    phone leaves or stops sending, its node first releases the lease, so another device continues the task immediately.
     """
 
     _log = Logger()
@@ -111,9 +111,9 @@ class Gateway:
         now = self._node.clock.seconds()
         removed_for = self._removed.get(uuid, now) - now
         if removed_for > 0.0:
-            return fail(Refusal("phone", "an operator removed it", f"wait {removed_for:.0f} s", 409))
+            return fail(Refusal("phone", "an operator removed this phone", f"wait {removed_for:.0f} s", 409))
         if len(self._phones) >= MAX_PHONES:
-            remedy = "wait until one leaves, or join at another web node"
+            remedy = "wait until a phone leaves, or join at another web node"
             return fail(Refusal("phone", f"this node already has {MAX_PHONES} phones", remedy, 409))
         team = self._node.team
         if team is not None and GATEWAY not in team.admission.me.roles:
@@ -129,10 +129,12 @@ class Gateway:
                     self._phones[uuid] = self._start_phone(uuid, seed, self._unique_name(name, uuid), can)
                 joined.callback(uuid)
             except EXPECTED_ERRORS as error:
-                joined.errback(Refusal("phone", f"its node cannot start: {error}", "try again in a moment", 503))
+                joined.errback(
+                    Refusal("phone", f"the node of this phone cannot start: {error}", "try again in a moment", 503)
+                )
             return left
 
-        # Wait until a former node of the same phone has stopped.
+        # Wait until the previous node of the same phone has stopped.
         self._stopping.get(uuid, succeed(None)).addCallback(enter)
         return joined
 
@@ -141,14 +143,14 @@ class Gateway:
         size = check_picture(jpeg)
         phone = self._phones.get(uuid)
         if phone is None:
-            raise Refusal("uuid", "this phone has not joined at this node", "join by POST /api/v1/phones", 404)
+            raise Refusal("uuid", "this phone has not joined at this node", "join with POST /api/v1/phones", 404)
         phone.restart_timer(PICTURE_TIMEOUT_S)
         if not phone.bucket.take(self._node.clock.seconds()):
-            raise Refusal("phone", "it sends too many pictures", f"send at most {TASK_FPS:g} a second", 429)
+            raise Refusal("phone", "the phone sends too many pictures", f"send at most {TASK_FPS:g} a second", 429)
         return phone.process_picture(jpeg, size, values)
 
     def leave(self, uuid: str) -> None:
-        """Stop the node of a phone, if there is one."""
+        """Stop the node of the phone ``uuid``; do nothing if the phone has no node here."""
         phone = self._phones.pop(uuid, None)
         if phone is None:
             return
@@ -188,7 +190,7 @@ class Gateway:
         return name if name not in taken else f"{name[:35]}-{uuid[:4]}"
 
     def _on_silence(self, uuid: str) -> None:
-        self._log.info("{name} has stopped sending", name=self._phones[uuid].name)
+        self._log.info("the phone {name} has stopped sending pictures", name=self._phones[uuid].name)
         self.leave(uuid)
 
     def _on_removed(self, uuid: str, seconds: float) -> None:
@@ -231,7 +233,7 @@ class _Phone:
             self._timer = self._node.clock.callLater(seconds, self._on_silence)
 
     def process_picture(self, jpeg: bytes, size: tuple[int, int], values: Mapping[str, float]) -> PictureReply:
-        """Pass on a picture, and return the requested frame rate and the instruction for the visitor."""
+        """Pass a picture to the driver; return the requested frame rate and the instruction for the visitor."""
         self._driver.process_picture(jpeg, *size, values)
         now = self._node.clock.seconds()
         place = {
@@ -267,7 +269,7 @@ class _Phone:
 
 
 def _make_settings(settings: Settings, node: SwarmNode, name: str, can: Mapping[str, Any]) -> Settings:
-    """Return the settings of a phone's node: it joins through this node, without faults and deployment."""
+    """Return the settings of a phone's node, which joins through ``node`` and allows neither faults nor deployment."""
     known = (node.entangled.contact.address, *settings.node.known_nodes)
     of_node = replace(
         settings.node,

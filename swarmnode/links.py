@@ -34,16 +34,16 @@ def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     links = argparse.ArgumentParser(
         prog="swarm links",
-        description="Show path and quality of a node's link to each peer; quality is from 0 (no reply) to 100.",
+        description="Show the path and quality of a node's link to each peer; the quality is from 0 (no reply) to 100.",
         epilog="Example: swarm links --node dog1",
     )
-    links.add_argument("--node", metavar="NAME", help="node on this machine, if several run")
+    links.add_argument("--node", metavar="NAME", help="name of the node, if several run on this machine")
     links.add_argument("--json", action="store_true", help="print JSON, on one line")
     return links
 
 
 def main(words: Sequence[str] | None = None, out: TextIO | None = None, ask: SendRequest = send_request) -> int:
-    """Run the command; returns 0, 1 if the node refused or a peer does not reply, 2 if no node can be asked."""
+    """Run the command; returns 0, 1 if the node rejected it or a peer does not reply, 2 if no node runs here."""
     out = out or sys.stdout
     options = make_parser().parse_args(words)
     try:

@@ -11,7 +11,7 @@ STARTUP_S = 3.0
 
 
 def block_tls_import() -> None:
-    """Hide pyOpenSSL from Twisted, which otherwise loads it into every process with a reactor and takes 13 MiB.
+    """Hide pyOpenSSL from Twisted, which would load 13 MiB into every process with a reactor.
 
     Call this before the reactor is imported; if pyOpenSSL is loaded already, nothing changes.
     """
@@ -24,7 +24,7 @@ def release_memory() -> None:
     glibc otherwise keeps freed memory.  A full collection visits every module of the process; in a web node it delays
     timers by 50 ms each time.
     """
-    import ctypes  # imported here, because short commands import this module, too
+    import ctypes  # imported here, because short commands also import this module
 
     gc.collect()
     gc.freeze()

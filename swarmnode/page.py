@@ -79,7 +79,7 @@ def make_page_service(
     node: SwarmNode,
     make_tls_port: Callable[..., TlsPort] | None,
 ) -> PageService:
-    """Return the page over the data store of ``node``; ``make_tls_port`` creates its TLS port, if it has one."""
+    """Return the page that shows the data store of ``node``; ``make_tls_port`` creates its TLS port (None: no TLS)."""
     address, wall, store = settings.web, dependencies.wall, settings.node.store
     simulator = None
     if address.yard is not None:
@@ -110,7 +110,7 @@ def make_page_service(
         invites=Invites(urls, authority, fingerprint, reactor, reactor.getThreadPool()),
     )
     live = partial(build_state, client.read, DepartedDevices(), settings.node.name)
-    # A separate memory of departed devices: the file is one commit behind the watched records.
+    # Each source has its own list of departed devices, because the file is one commit behind the watched records.
     on_file = partial(build_state, partial(read_records, Path(store)), DepartedDevices(), settings.node.name)
     stored = live if store == IN_MEMORY else on_file
     web = WebService(

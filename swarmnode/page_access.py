@@ -39,7 +39,7 @@ class PageAccess:
 
     @property
     def link(self) -> str:
-        """The address that signs in automatically; browsers do not send the part after the ``#``."""
+        """The address with the sign-in code after the ``#``; browsers do not send that part to the server."""
         return f"{self.url}#code={self.code}" if self.code else self.url
 
 
@@ -52,7 +52,7 @@ def make_url(host: str, port: int, scheme: str = "http") -> str:
 def announce_page(
     name: str, host: str, port: Callable[[], int], code: str, secure_port: int = 0, terminal: TextIO | None = None
 ) -> None:
-    """Log the address of the page, and write its file; if that fails, log the reason.
+    """Log the address of the page, and write its file; if the file cannot be written, log the reason.
 
     ``terminal`` is the terminal of a user who may see the code.
     """
@@ -71,7 +71,7 @@ def announce_page(
 
 
 def find_terminal() -> TextIO | None:
-    """Return the terminal from which this process was started; None if there is none, or it is a log."""
+    """Return the terminal from which this process was started; None without a terminal or if stderr is a log."""
     # twistd redirects sys.stderr to its log.
     stream = sys.__stderr__
     try:
@@ -81,7 +81,7 @@ def find_terminal() -> TextIO | None:
 
 
 def list_pages() -> list[PageAccess]:
-    """Return the pages of running nodes on this machine; raises ``NoControl`` if the folder is another user's."""
+    """Return the pages of running nodes on this machine; raises ``NoControl`` if another user owns the folder."""
     found = []
     for path in list_files(PAGE_FILE_SUFFIX):
         try:

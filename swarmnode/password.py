@@ -14,7 +14,7 @@ from webnode.password import MAX_LENGTH, MIN_LENGTH, SALT_BYTES, hash_password
 
 def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    about = "Ask for a password, and print its hash for the settings, as [web] password."
+    about = "Ask for a password, and print its hash for the setting [web] password."
     return argparse.ArgumentParser(prog="swarm password", description=about, epilog="Example: swarm password")
 
 
@@ -31,9 +31,9 @@ def main(
         password = ask("Password: ")
         problem = ""
         if not MIN_LENGTH <= len(password) <= MAX_LENGTH:
-            problem = f"the password has {len(password)} characters; use {MIN_LENGTH} to {MAX_LENGTH}"
+            problem = f"the password has {len(password)} characters; a password must have {MIN_LENGTH} to {MAX_LENGTH}"
         elif password != password.strip() or not password.isprintable():
-            problem = "the password begins or ends with a space, or has an unprintable character; use another one"
+            problem = "the password begins or ends with a space, or has an unprintable character; choose another"
         elif ask("Repeat the password: ") != password:
             problem = "the passwords are not the same; try again"
     except (EOFError, KeyboardInterrupt):

@@ -42,7 +42,7 @@ ERROR_KEYS: Sequence[tuple[type[Exception], str]] = (
     (PortTaken, "[web] port"),
     (MissingExtra, "[node] roles"),
 )
-"""Setting to name in the message of each error."""
+"""The setting that the message of each error mentions."""
 
 KEY_FILE_OPTION = "team-key-file"
 MAX_PORT_TRIES = 5
@@ -54,7 +54,7 @@ class Options(usage.Options):
 
     synopsis = "[--config FILE] [flags]"
     longdesc = (
-        "Run one node of a team: peer of the network, agent of a device, and page if it has the web role.\n\n"
+        "Run one node of a team: a network peer, the agent of a device, and the page if the role is web.\n\n"
         "Example: twistd --nodaemon swarm-node --config dog1.toml"
     )
     optParameters = [
@@ -88,7 +88,7 @@ class Options(usage.Options):
         _exit_with_error(BadSetting(COMMAND_LINE, "--team-key", problem, remedy))
 
     def postOptions(self) -> None:
-        """Read the file and the flags; an error is printed in one line, with exit code 2."""
+        """Read the settings file and the flags; on an error print one line and exit with code 2."""
         flags = {
             name.replace("-", "_"): value for name, value in self.items() if name not in ("config", KEY_FILE_OPTION)
         }
@@ -141,7 +141,7 @@ class CheckedService(NodeService):
     """A node service that reports a failed start in one line, with exit code 2."""
 
     def startService(self) -> None:
-        """Start; if the default port has been taken since it was checked, try the next ones."""
+        """Start the node; if another program has taken the default port since the check, try the next ports."""
         try:
             for left in reversed(range(MAX_PORT_TRIES)):
                 try:

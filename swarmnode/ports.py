@@ -11,19 +11,19 @@ from twisted.logger import Logger
 from middleware.config.settings import Settings
 
 PORT_COUNT = 8
-"""Number of ports to try: the default and the next ones, so a firewall can be opened for them; then any port."""
+"""Number of ports to try from the default on: few, so a firewall can allow them.  After these, any port is used."""
 
 IsFree = Callable[[socket.SocketKind, str, int], bool]
 _log = Logger()
 
 
 def is_free(kind: socket.SocketKind, host: str, port: int) -> bool:
-    """Return whether a program could listen there now; True also for an invalid ``host``, which is reported later."""
+    """Return whether a program could listen on ``port`` now; True for an invalid ``host``, which is reported later."""
     try:
         found = socket.getaddrinfo(host or None, port, type=kind, flags=socket.AI_PASSIVE)
         with socket.socket(found[0][0], kind) as tried:
             if kind == socket.SOCK_STREAM:
-                # As the real listener does: a port in TIME_WAIT is free.
+                # Like the real listener, treat a port in TIME_WAIT as free.
                 tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             tried.bind(found[0][4])
     except OSError as error:
@@ -32,7 +32,7 @@ def is_free(kind: socket.SocketKind, host: str, port: int) -> bool:
 
 
 def replace_busy_ports(settings: Settings, is_free: IsFree = is_free) -> Settings:
-    """Replace each default port that is in use by a free one; ports that were set stay."""
+    """Replace each default port that is in use by a free port; ports that were set do not change."""
     node, web = settings.node, settings.web
     if not settings.is_given("node", "port"):
         host = "" if node.host == "*" else node.host

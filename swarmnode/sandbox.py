@@ -28,9 +28,9 @@ ALLOWED_LIBRARIES = (
     *("traceback", "types", "typing", "zlib", "cv2", "numpy"),
 )
 ALLOWED_PREFIXES = ("agents.", "drivers.reading", "middleware.consensus.", "middleware.entangled.value", "numpy.")
-"""Further names that a module may import, by prefix."""
+"""Prefixes of further names that a pushed module may import."""
 LAZY_IMPORTS = {"numpy": ("numpy.fft", "numpy.random")}
-"""Modules that a library imports at first use, when imports are no longer possible."""
+"""Modules that a library imports at first use; they are imported early, because later imports are not possible."""
 _IMPORT = re.compile(rb"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import|import[ \t]+([\w., \t]+))", re.MULTILINE)
 
 
@@ -56,7 +56,7 @@ def find_allowed_imports(source: bytes) -> list[str]:
 
 def _prepare(parent: int, source: bytes) -> list[str]:
     for name in find_allowed_imports(source):
-        with suppress(Exception):  # the module's own import raises again
+        with suppress(Exception):  # the same import in the pushed module raises again
             importlib.import_module(name)
     os.environ.clear()
     sys.path.clear()
@@ -67,7 +67,7 @@ def main() -> None:
     """Answer requests until the node closes the pipe."""
     out = os.dup(1)
     null = os.open(os.devnull, os.O_RDWR)
-    os.dup2(null, 1)  # output of the module must not be taken for a reply
+    os.dup2(null, 1)  # printed output of the module must not be taken for a reply
     os.close(null)
     with suppress(OSError):
         os.rmdir(os.getcwd())  # the folder is empty and not needed

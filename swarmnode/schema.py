@@ -16,7 +16,7 @@ from middleware.config.settings import TABLES
 
 
 def make_json_schema() -> dict[str, Any]:
-    """Return the schema; settings with a further conversion step accept fewer values than it allows."""
+    """Return the schema; for some settings it allows values that their later conversion rejects."""
     tables = {name: _make_struct(name, cls) for name, cls in TABLES.items()}
     optional: list[tuple[str, Any, Any]] = [
         (name, table, msgspec.field(default_factory=dict)) for name, table in tables.items() if name != "node"

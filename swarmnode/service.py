@@ -60,7 +60,7 @@ class NodeService(Service):
         self._stop_fronts()
 
     def leave_for(self, seconds: float) -> None:
-        """Leave the network with the robot, and return after ``seconds``."""
+        """Leave the network and disconnect the robot as in a failure; return after ``seconds``."""
         if self._rejoin_call is None and self.running:
             self._log.info("{name} leaves the network for {s:g} s", name=self.settings.node.name, s=seconds)
             self.vanish()

@@ -1,6 +1,6 @@
 """A simulated team in one process in virtual time: a laptop, three dogs and the robot simulator (``swarm trials``).
 
-The nodes are real ones, with in-memory implementations of clock, network and store.
+The nodes run their production code with in-memory implementations of clock, network and store.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ REPLY_TIMEOUT_S = 6.0
 
 
 class SimulatedTeam(Simulation):
-    """A laptop and its dogs; a seed reproduces a run exactly.
+    """A laptop and its dogs; a run with the same seed is identical.
 
-    Node, agent, driver, simulator and detection are the real ones.  ``dogs`` are the dogs that join at the start; the
+    Node, agent, driver, simulator and detection run their production code.  ``dogs`` join at the start; the
     simulator has a robot for each of ``DOGS``.  ``others`` are nodes without a robot, which join before the dogs.
     ``conditions`` applies to every link.  With ``faults`` the nodes accept fault injection.
     """
@@ -161,7 +161,7 @@ class SimulatedTeam(Simulation):
         self.services[name].vanish()
 
     def freeze(self, name: str) -> None:
-        """Stop a node as SIGSTOP does; its robot is another machine and continues."""
+        """Stop a node as SIGSTOP does; its robot, a separate machine, continues."""
         self.machines[name].freeze()
 
     def unfreeze(self, name: str) -> None:
@@ -202,7 +202,7 @@ class _Process:
 
 
 class SimulatedStage:
-    """A virtual team with fault injection at every node; ``digest`` shows whether two runs were identical."""
+    """A simulated team with fault injection at every node; identical runs have the same ``digest``."""
 
     def __init__(self, seed: int) -> None:
         self.team = SimulatedTeam(seed, faults=True)
@@ -219,7 +219,7 @@ class SimulatedStage:
         self.team.clock.advance(seconds)
 
     def devices(self) -> list[Device]:
-        """Return the present devices, as seen by the laptop."""
+        """Return the devices that are online, as seen by the laptop."""
         return [device for device, _ in parse_devices(self._watch.records)]
 
     def assign(self, task: str) -> str:
@@ -227,7 +227,7 @@ class SimulatedStage:
         return str(self._call(self._node.presence.device, ASSIGN_METHOD, task))
 
     def inject(self, device: Device, fault: Fault) -> float:
-        """Order the fault from the laptop."""
+        """Request the fault through the laptop; return the delay in seconds until it begins."""
         return parse_delay(self._call(device, CAUSE_METHOD, fault.kind, fault.seconds, fault.amount or None))
 
     def is_over(self, task_id: str) -> bool:
@@ -248,7 +248,7 @@ class SimulatedStage:
         record = next((record for each, record in parse_devices(self._watch.records) if each.uuid == device.uuid), None)
         contact = None if record is None else self._node.find_contact(record)
         if contact is None:
-            raise Rejection(f"{device.name} is not present")
+            raise Rejection(f"{device.name} is not online")
         return self._wait_for(self._node.entangled.call(contact, method, *arguments, changes=True))
 
     def _wait_for(self, work: Deferred[Any]) -> Any:

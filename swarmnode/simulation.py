@@ -44,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     signals: list[int] = []
 
     def end(number: int, frame: FrameType | None) -> None:
-        """Let the run end with a report after the first signal, and immediately after the second."""
+        """End the run with a report at the first signal, and immediately at the second signal."""
         if signals:
             raise KeyboardInterrupt
         signals.append(number)
@@ -72,7 +72,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _reduce_garbage_collection() -> None:
-    """Collect garbage rarely, and never among current objects, because this process ends with them."""
+    """Collect garbage rarely, and never among the current objects, which exist until the process ends."""
     gc.collect()
     gc.freeze()
     gc.set_threshold(*GC_THRESHOLDS)

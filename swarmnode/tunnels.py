@@ -23,7 +23,7 @@ def add_tunnels(
     rng: random.Random,
     environment: Mapping[str, str],
 ) -> Callable[[], Network]:
-    """Return the factory of the node's network; ``udp`` if there are no tunnels."""
+    """Return the factory of a network with UDP and tunnels, or ``udp`` itself if there are no tunnels."""
     urls = settings.tunnel_urls
     if not (urls or settings.tunnel_port):
         return udp
@@ -43,7 +43,7 @@ def add_tunnels(
 
 
 def find_proxy(environment: Mapping[str, str], url: Url) -> Proxy | None:
-    """Return the HTTP proxy for ``url`` by ``https_proxy`` and ``no_proxy``; None if there is none."""
+    """Return the HTTP proxy that ``https_proxy`` and ``no_proxy`` set for ``url``, or None without a proxy."""
     proxy = environment.get("https_proxy") or environment.get("HTTPS_PROXY") or ""
     excluded = environment.get("no_proxy") or environment.get("NO_PROXY") or ""
     for name in (word.strip().lstrip(".") for word in excluded.split(",")):

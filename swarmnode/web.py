@@ -16,7 +16,7 @@ from swarmnode.dependencies import Dependencies
 
 
 def add_sign_in_code(settings: Settings, rng: random.Random) -> Settings:
-    """Return ``settings`` with a sign-in code; drawn once, so the code stays the same when the node rejoins."""
+    """Return ``settings`` with a sign-in code that stays the same when the node rejoins."""
     from webnode.password import draw_code
 
     web = settings.web
@@ -24,7 +24,7 @@ def add_sign_in_code(settings: Settings, rng: random.Random) -> Settings:
 
 
 def make_web_page(settings: Settings, dependencies: Dependencies, reactor: Any, node: SwarmNode) -> IService:
-    """Return the page over the node's data store; raises ``MissingExtra``, or ``BadSetting`` if TLS is unavailable."""
+    """Return the page that shows the node's data store; raises ``MissingExtra``, or ``BadSetting`` without TLS."""
     try:
         from swarmnode.page import make_page_service
     except ModuleNotFoundError as error:

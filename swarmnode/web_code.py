@@ -31,7 +31,7 @@ def main(
     out: TextIO | None = None,
     known: Callable[[], list[PageAccess]] = list_pages,
 ) -> int:
-    """Run the command; returns 0, or 2 if there is no page."""
+    """Run the command; returns 0, or 2 if no node with a page runs here."""
     out = out or sys.stdout
     options = make_parser().parse_args(words)
     try:

@@ -28,17 +28,17 @@ def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     why = argparse.ArgumentParser(
         prog="swarm why",
-        description="Explain the choice of a device for a task.",
+        description="Explain why a device was assigned to a task, from the agents' signed decision records.",
         epilog="Example: swarm why last",
     )
     why.add_argument("task", metavar="TASK", help=f"beginning of a task's id, or {LAST_TASK!r} for the newest task")
-    why.add_argument("--node", metavar="NAME", help="node on this machine, if several run")
+    why.add_argument("--node", metavar="NAME", help="name of the node, if several run on this machine")
     why.add_argument("--json", action="store_true", help="print JSON, on one line")
     return why
 
 
 def main(words: Sequence[str] | None = None, out: TextIO | None = None, ask: SendRequest = send_request) -> int:
-    """Run the command; returns 0, 1 if there is no decision or the node refused, 2 if no node can be asked."""
+    """Run the command; returns 0, 1 if there is no decision or the node rejected it, 2 if no node runs here."""
     out = out or sys.stdout
     options = make_parser().parse_args(words)
     try:
@@ -77,5 +77,5 @@ def select_task(wanted: str, tasks: Sequence[Task]) -> Task:
         return newest[wanted] if wanted in newest else matching[0]
     near = ", ".join(task.task_id for task in (matching or known)[:MAX_LISTED])
     if matching:
-        raise Rejection(f"{len(matching)} tasks begin with {wanted!r}: {near}; give more of the id")
-    raise Rejection(f"no task begins with {wanted!r}; the newest are {near}")
+        raise Rejection(f"{len(matching)} task ids begin with {wanted!r}: {near}; enter more characters")
+    raise Rejection(f"no task id begins with {wanted!r}; the newest are {near}")

@@ -2,5 +2,5 @@
 
 ``state`` builds the view, ``app`` serves the page and JSON with Flask, ``live`` serves the native streams (state and
 cameras), ``server`` puts both on one port inside Twisted, and ``team_control`` carries out an operator's requests.
-This package knows nothing of robots and peers.
+This package does not depend on robots or peers.
 """

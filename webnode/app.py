@@ -43,7 +43,7 @@ def _call_directly(call: Callable[..., Any], *arguments: Any, limit_s: float | N
     outcomes: list[Any] = []
     result.addBoth(outcomes.append)
     if not outcomes:
-        raise Refusal("node", "it did not answer in time", "look at the state, then try again", 503)
+        raise Refusal("node", "the node did not answer in time", "check the state, then try again", 503)
     if isinstance(outcomes[0], Failure):
         outcomes[0].raiseException()
     return outcomes[0]

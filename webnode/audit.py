@@ -19,13 +19,13 @@ MAX_FILE_BYTES = 1 << 20
 """Size limit of the file in bytes; a full file is renamed to ``.1``, so there are at most two."""
 TAIL_BYTES = 1 << 16
 QUIET_S, KNOWN = 60.0, 256
-"""Seconds within which equal requests of a client without a session are one line, and the number of clients kept."""
+"""Seconds within which equal requests of a client without a session give one line; maximum number of such clients."""
 
 
 class AuditLog:
-    """The audit log in the file at ``path``, or only in memory if that is None; ``wall`` returns unix time in seconds.
+    """The audit log in the file at ``path``, or only in memory if ``path`` is None; ``wall`` returns unix time.
 
-    If the file cannot be written, the log says so once and the page continues to work.
+    If the file cannot be written, the node's log gets one warning and the page continues to work.
     """
 
     _log = Logger()
@@ -73,7 +73,7 @@ class AuditLog:
         return self._counts
 
     def _count_repetitions(self, key: tuple[str, str, str], now: float) -> int | None:
-        """Return the number of repetitions suppressed since the last line; None if this one is suppressed as well."""
+        """Return the number of repetitions suppressed since the last line; None if this one is suppressed, too."""
         known = self._repeated.get(key)
         if known is not None and 0.0 <= now - known[0] < QUIET_S:
             known[1] += 1

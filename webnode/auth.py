@@ -34,8 +34,8 @@ class User:
 class Token:
     """The credentials of a session: ``text`` for a header, ``ticket`` for the query of a GET.
 
-    The ticket belongs to the same session and only reads, as URLs leak more easily than headers.  ``until`` is unix
-    seconds.
+    The ticket belongs to the same session and can only read, because URLs leak more easily than headers.  ``until`` is
+    unix seconds.
     """
 
     text: str
@@ -48,13 +48,13 @@ class Sessions(Protocol):
     """The signed-in users; ``now`` is unix seconds."""
 
     code: str
-    """The sign-in code of operators; empty if none is needed."""
+    """The sign-in code of operators; empty if no sign-in is needed."""
 
     def sign_in(self, proof: str, source: str, now: float) -> Deferred[Token]:
         """Sign in with a code or password, from the address ``source``; fails with ``Refusal`` 401 or 429."""
 
     def authenticate(self, token: str, now: float) -> User:
-        """Return the user of a token or ticket, without one a user with the role ``anyone``; never raises."""
+        """Return the user of a token or ticket; for an invalid one a user with the role ``anyone``.  Never raises."""
 
     def issue_guest_token(self, user: User, name: str, role: Role, now: float, seconds: float) -> Token:
         """Return a token for a guest of ``user``, valid no longer than ``user`` can stay."""
@@ -63,12 +63,12 @@ class Sessions(Protocol):
         """Return a token for ``user`` under another name, which ends with the session."""
 
     def renew_token(self, user: User, now: float) -> Token:
-        """Return a later token for the same session; raises ``Refusal`` 401 for anyone and for a ticket."""
+        """Return a later token for the same session; raises ``Refusal`` 401 for the role ``anyone`` or a ticket."""
 
     def issue_peer_tokens(self, user: User, nodes: Iterable[str], now: float) -> dict[str, Token]:
         """Return tokens for the same session at the web nodes ``nodes`` (uuids), each valid there for some minutes.
 
-        Raises ``Refusal`` 401 for anyone and for a ticket.
+        Raises ``Refusal`` 401 for the role ``anyone`` and for a ticket.
         """
 
     def revoke(self, token_id: str, until: float = math.inf) -> None:

@@ -23,8 +23,8 @@ WaitingRequest = tuple[Request, bytes, IDelayedCall]
 class CameraStream:
     """The newest picture of one device, and the requests that wait for the next one.
 
-    ``open_upstream`` may raise ``Refusal``.  An upstream that is silent for ``POLL_S`` is reopened, as the device may
-    have a new address.  A camera ends two seconds after its last request.
+    ``open_upstream`` may raise ``Refusal``.  An upstream that is silent for ``POLL_S`` is reopened, because the device
+    may have a new address.  A camera ends two seconds after its last request.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class CameraStream:
         request.notifyFinish().addErrback(lambda _: self._forget(entry))
 
     def on_frame(self, seq: int, jpeg: bytes, age: float) -> None:
-        """Take a picture that is ``age`` seconds old; drop it if it is late, too large or no JPEG."""
+        """Take a picture that is ``age`` seconds old; drop it if it is late, too large or not a JPEG."""
         if self._is_ended or len(jpeg) > MAX_FRAME_BYTES or read_size(jpeg) is None:
             return
         now = self._clock.seconds()

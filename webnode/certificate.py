@@ -31,7 +31,7 @@ HASH_PERSON = b"swarm-page-tls"
 CURVE_ORDER = 0xFFFFFFFF00000000FFFFFFFFFFFFFFFFBCE6FAADA7179E84F3B9CAC2FC632551
 """Order of the group of P-256; a private key is a number below it."""
 FROM, UNTIL = datetime(2025, 1, 1, tzinfo=UTC), datetime(2049, 12, 31, tzinfo=UTC)
-"""Validity of the authority; constant, as the certificate is the same after each start, whatever the clock says."""
+"""Validity of the authority; constant, so the certificate is the same after each start, whatever the clock shows."""
 VALIDITY = timedelta(days=365)
 """Validity of a node's certificate; phones reject certificates that are valid for more than 825 days."""
 CLOCK_TOLERANCE = timedelta(days=2)
@@ -98,7 +98,7 @@ class Leaf(Credential):
 
     @property
     def pem_with_key(self) -> bytes:
-        """Both in PEM; secret."""
+        """The certificate and its private key in PEM; secret."""
         return bytes(self.key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())) + self.pem
 
     def find_flaw(self, signer: Authority, names: Collection[str], now: float) -> str:
@@ -107,21 +107,21 @@ class Leaf(Credential):
         if _encode_point(self.key) != certificate.public_key().public_bytes(
             Encoding.X962, PublicFormat.UncompressedPoint
         ):
-            return "its key does not match"
+            return "the certificate does not belong to its private key"
         try:
             certificate.verify_directly_issued_by(signer.certificate)
         except (InvalidSignature, ValueError, TypeError):
-            return "another authority signed it"
+            return "another authority signed the certificate"
         if moment < certificate.not_valid_before_utc:
-            return "it is not valid yet"
+            return "the certificate is not valid yet"
         if moment > certificate.not_valid_after_utc - RENEWAL_MARGIN:
-            return "it expires soon"
+            return "the certificate expires soon"
         missing = [name for name in filter_names(names) if name not in self.names]
-        return f"it lacks {', '.join(missing)}" if missing else ""
+        return f"the certificate lacks {', '.join(missing)}" if missing else ""
 
     @property
     def names(self) -> list[str]:
-        """The addresses and names for which it is valid."""
+        """The addresses and names for which the certificate is valid."""
         try:
             found = self.certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
         except x509.ExtensionNotFound:
@@ -135,11 +135,11 @@ def parse_leaf(pem: bytes) -> Leaf:
         key = load_pem_private_key(pem, None)
         certificate = x509.load_pem_x509_certificate(pem)
     except (ValueError, TypeError, UnsupportedAlgorithm) as error:
-        raise ValueError("it holds no certificate with its key") from error
+        raise ValueError("the file does not contain a certificate and its private key") from error
     if not isinstance(key, ec.EllipticCurvePrivateKey) or not isinstance(
         certificate.public_key(), ec.EllipticCurvePublicKey
     ):
-        raise ValueError("its key is not an elliptic curve key")
+        raise ValueError("the private key is not an elliptic curve key")
     return Leaf(key, certificate)
 
 

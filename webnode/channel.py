@@ -1,4 +1,4 @@
-"""One HTTP connection with deadlines and limits per address; it knows nothing of routes.
+"""One HTTP connection with deadlines and limits per address; independent of routes.
 
 Twisted's idle timeout does not end a connection that sends a byte now and then (Slowloris).  So each part of a request
 has a deadline, an address has a limit of incomplete requests, and a client that does not read its response is
@@ -33,12 +33,18 @@ CLOSE_LIMIT_S = 2.0
 """Time for a refused client to read the reason."""
 STATUS = {400: "Bad Request", 408: "Request Timeout", 413: "Content Too Large", 503: "Service Unavailable"}
 
-TOO_LARGE = Refusal("body", "it is too large", "send at most 64 KiB", 413)
-UNREADABLE = Refusal("request", "it is not valid HTTP", "send HTTP/1.1, with at most 16 KiB of headers", 400)
-LATE_HEAD = Refusal("request", "headers not complete in time", f"send all headers within {HEADERS_LIMIT_S:g} s", 408)
-LATE_BODY = Refusal("body", "it arrives too slowly", f"send at least {PACE:g} bytes a second", 408)
-TOO_MANY = Refusal("request", "too many incomplete requests from this address", "complete those first", 503)
-TOO_BUSY = Refusal("request", "too many open requests from this address", "close some, then try again", 503)
+TOO_LARGE = Refusal("body", "the request is too large", "send at most 64 KiB", 413)
+UNREADABLE = Refusal("request", "the request is not valid HTTP", "send HTTP/1.1, with at most 16 KiB of headers", 400)
+LATE_HEAD = Refusal(
+    "request", "the headers are not complete in time", f"send all headers within {HEADERS_LIMIT_S:g} s", 408
+)
+LATE_BODY = Refusal("body", "the body arrives too slowly", f"send at least {PACE:g} bytes a second", 408)
+TOO_MANY = Refusal(
+    "request", "there are too many incomplete requests from this address", "complete these requests first", 503
+)
+TOO_BUSY = Refusal(
+    "request", "there are too many open requests from this address", "close some of them, then try again", 503
+)
 
 
 def make_raw_response(refusal: Refusal) -> bytes:
@@ -51,7 +57,7 @@ def make_raw_response(refusal: Refusal) -> bytes:
 
 
 class LimitedRequest(SiteRequest):
-    """A request whose body is limited to ``guard.MAX_BODY``; a larger one is answered with 413 and disconnected.
+    """A request with a limit for its body, ``guard.MAX_BODY``; a larger body is answered with 413 and disconnected.
 
     ``authenticated_user`` is the client of a request to a native resource.
     """

@@ -65,7 +65,7 @@ class Diagnostics:
         """Fire with the records that a device stores; fails with ``Refusal`` 409 or 504."""
         device = self._client.view.find_device(uuid)
         if device is None:
-            raise Refusal("device", "it has left the network", "wait until it is back", 409)
+            raise Refusal("device", "the device has left the network", "wait until the device is back", 409)
         return self._query_device(uuid, INVENTORY_METHOD).addCallbacks(
             _make_inventory_view, _raise_refusal, errbackArgs=(device.name,)
         )
@@ -124,8 +124,10 @@ class _Query:
 def _raise_refusal(failure: Any, name: str) -> None:
     failure.trap(EntangledError)
     if failure.check(Refused):
-        raise Refusal("device", f"{name} refused: {failure.getErrorMessage()}", "update it to this version", 409)
-    raise Refusal("device", f"{name} did not answer", "wait until it is back, then try again", 504)
+        raise Refusal(
+            "device", f"{name} refused: {failure.getErrorMessage()}", "update the device to this version", 409
+        )
+    raise Refusal("device", f"{name} did not answer", "wait until the device is back, then try again", 504)
 
 
 def _read_list(value: object) -> list[Any]:
@@ -172,7 +174,7 @@ def _make_links_view(reply: dict[Any, Any], names: dict[str, str]) -> Json:
 
 
 def _make_link_view(reply: dict[Any, Any], names: dict[str, str]) -> Json:
-    """Return one path and its score, which is None if nothing is measured."""
+    """Return one path and its score, which is None without a measurement."""
     path_kind, by = reply.get("way"), clean_text(reply.get("by"), limit=64)
     loss, round_trip, jitter = (clean_distance(reply.get(name)) for name in ("loss", "round_trip", "jitter"))
     loss = None if loss is None else min(loss, 1.0)

@@ -22,7 +22,7 @@ class Dispatch:
         self._answers: OrderedDict[tuple[str, str, str], _Answer] = OrderedDict()
 
     def carry_out(self, route: Route, request: RouteRequest) -> Deferred[Any]:
-        """Return the answer; a repeated id of the same session gets the first answer again."""
+        """Return the answer; a request that repeats an id of the same session gets the first answer again."""
         # A route that a viewer may call changes nothing, whatever its method.
         if route.method == "GET" or route.role == "viewer":
             return self._call(route, request)

@@ -1,7 +1,7 @@
 """Derive events from successive states of the team.  Pure.
 
 Events: a device arrives or leaves, a task changes its status, a group agrees on an agent, and a takeover with its
-duration.  The event log starts with its node and knows nothing earlier.
+duration.  The event log starts with its node and has no earlier events.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ class _Loss:
 class EventLog:
     """The newest entries, in memory only.
 
-    A takeover is timed from the moment at which the acting device was seen to be gone, or from the injected fault if
-    there was one.
+    The duration of a takeover counts from the moment at which the acting device was noticed to be missing, or from the
+    fault that was injected into it.
     """
 
     def __init__(self, max_entries: int = MAX_ENTRIES) -> None:
@@ -59,7 +59,7 @@ class EventLog:
         self._losses: dict[str, _Loss] = {}
 
     def record_state(self, state: State, now: float) -> None:
-        """Compare the next state, read at ``now`` (unix seconds), with the one before."""
+        """Compare the next state, read at ``now`` (unix seconds), with the previous state."""
         before, self._last_state = self._last_state, state
         if not before:
             self._add(now, "start", text=f"{state.get('node') or 'this node'} starts to observe")
@@ -74,7 +74,7 @@ class EventLog:
         self._compare_stops(before, state, now)
 
     def record_fault(self, uuid: str, kind: str, now: float) -> None:
-        """Record an injected fault, so that the takeover is timed from it."""
+        """Record an injected fault, from which the duration of a takeover counts."""
         name = _index_rows(self._last_state, "devices", "uuid").get(uuid, {}).get("name", uuid[:8])
         task = next((task for task, acting in self._acting.items() if uuid in acting), "")
         if task:
@@ -168,14 +168,14 @@ class EventLog:
         for task in [*self._losses]:
             if task in ended or (not self._losses[task].is_gone and now - self._losses[task].at > FAULT_ATTRIBUTION_S):
                 del self._losses[task]
-        # Between two acting devices there may be none for some time: keep the last one until the next acts.
+        # When a task passes to another device, no device acts for some time: keep the previous device until then.
         self._acting = {**{task: uuids for task, uuids in self._acting.items() if task not in ended}, **acting}
 
     def _record_takeover(self, task: str, title: str, uuids: set[str], names: Mapping[str, str], now: float) -> None:
         before, loss = self._acting.get(task, set()), self._losses.get(task)
         fresh = sorted(uuids - before)
         if loss is not None and loss.is_gone and loss.uuid in uuids:
-            del self._losses[task]  # it returned before a takeover
+            del self._losses[task]  # the device returned before a takeover
         elif fresh and loss is not None and loss.uuid not in uuids:
             took = round(now - loss.at, 2)
             change = f"{names[fresh[0]]} takes over {title} from {loss.name}: {took:.1f} s"

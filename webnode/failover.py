@@ -59,7 +59,7 @@ class Fallbacks:
 
 
 def get_origin(url: str) -> str:
-    """Return the origin of the page at ``url`` as browsers name it; "" if the URL is not valid for a page of a team.
+    """Return the origin of the page at ``url`` as browsers write it; "" if the URL is not valid for a page of a team.
 
     ``localhost`` and all loopback addresses become 127.0.0.1.
     """
@@ -116,8 +116,8 @@ class _Served:
 class TeamFallbacks(Fallbacks):
     """The web nodes of a running team; ``clock`` counts seconds.
 
-    Only gateways count: in a closed team the nodes that have this role now; in an open team every node that serves the
-    page or did so within the last hour.
+    Only gateways are listed.  In a closed team these are the nodes that have this role now; in an open team every node
+    that serves the page or has served it within the last hour.
     """
 
     def __init__(self, node: SwarmNode, clock: Callable[[], float]) -> None:
@@ -153,7 +153,7 @@ class TeamFallbacks(Fallbacks):
     def is_allowed_origin(self, origin: str) -> bool:
         """Return whether ``origin`` belongs to a page of a gateway, now or within the last hour.
 
-        A loopback origin is accepted if its scheme and port match, as its page comes from this machine.
+        A loopback origin is accepted if its scheme and port match, because its page comes from this machine.
         """
         wanted, now = get_origin(origin), self._clock()
         if not wanted:

@@ -22,7 +22,7 @@ from webnode.sanitize import Json, clean_text
 ANSWER_LIMIT_S = 1.5
 """Timeout of a device's reply in seconds; the browser waits for two."""
 SHOWN_S = 60.0
-"""Seconds for which a fault that has ended is still listed."""
+"""Seconds for which a fault is listed after its end."""
 MAX_FAULTS = 50
 MAX_NAMES = 1000
 """Maximum number of devices known; beyond it, absent devices are forgotten."""
@@ -58,7 +58,7 @@ class FaultControl:
     def inject(self, uuid: str, kind: str, seconds: float, amount: float | None) -> Deferred[None]:
         """Inject a fault, by default with the usual ``amount``; fires when the device has accepted it.
 
-        Fails with ``Refusal``: 400 for an invalid field, 409 and 504 for the device.  The takeover is timed from the
+        Fails with ``Refusal``: 400 for an invalid field, 409 and 504 for the device.  The takeover time counts from the
         beginning that the device announced.
         """
         try:
@@ -68,7 +68,7 @@ class FaultControl:
         record = next((each for device, each in parse_devices(self._watch.records) if device.uuid == uuid), None)
         contact = None if record is None else self._node.find_contact(record)
         if contact is None:
-            return fail(Refusal("device", "it has left the network", "wait until it is back", 409))
+            return fail(Refusal("device", "the device has left the network", "wait until the device is back", 409))
         name = self._names.get(uuid, "it")
         if kind not in self.get_kinds(uuid):
             allowed = ", ".join(self.get_kinds(uuid))
@@ -87,8 +87,8 @@ class FaultControl:
         def refused(failure: Any) -> None:
             failure.trap(EntangledError)
             if failure.check(NoAnswer):
-                raise Refusal("device", f"{name} does not answer", "wait until it is back", 504)
-            problem = clean_text(failure.getErrorMessage(), "it refused")
+                raise Refusal("device", f"{name} does not answer", "wait until the device is back", 504)
+            problem = clean_text(failure.getErrorMessage(), "the device rejected the fault")
             raise Refusal("device", f"{name}: {problem}", "check its settings", 409)
 
         call = self._node.entangled.call(
@@ -154,7 +154,7 @@ class FaultControl:
         def handle_failure(failure: Any) -> None:
             failure.trap(EntangledError)
             if failure.check(NoAnswer):
-                self._queried.discard(uuid)  # ask again at the next change of any device
+                self._queried.discard(uuid)  # query again at the next change of any device
             else:
                 self._kinds.pop(uuid, None)
 

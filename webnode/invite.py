@@ -57,5 +57,5 @@ class Invites:
         return sort_by_reach(self._urls())
 
     def draw_qr_code(self, text: str) -> Deferred[str]:
-        """Draw a QR code on a worker thread, as it takes a small device a tenth of a second."""
+        """Draw a QR code on a worker thread, because this takes a small device a tenth of a second."""
         return deferToThreadPool(self._reactor, self._pool, make_qr_code, text)

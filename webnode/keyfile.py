@@ -21,15 +21,15 @@ def read_key_file(path: Path) -> bytes | None:
     except FileNotFoundError:
         return None
     except OSError as error:
-        raise UnsafeFile(f"it cannot be read ({error.strerror})") from error
+        raise UnsafeFile(f"the file cannot be read ({error.strerror})") from error
     try:
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode):
-            raise UnsafeFile("it is not a regular file")
+            raise UnsafeFile("the path is not a regular file")
         if status.st_uid not in (os.geteuid(), 0):
-            raise UnsafeFile("it belongs to another user")
+            raise UnsafeFile("the file belongs to another user")
         if status.st_mode & 0o077:
-            raise UnsafeFile(f"other users can read or write it (mode {stat.S_IMODE(status.st_mode):o})")
+            raise UnsafeFile(f"other users can read or write the file (mode {stat.S_IMODE(status.st_mode):o})")
         return os.read(descriptor, MAX_FILE_BYTES)
     finally:
         os.close(descriptor)

@@ -8,7 +8,7 @@ from typing import Literal
 CountedKind = Literal["unfinished", "stream", "open"]
 """Incomplete requests, responses in progress (streams and long polls included), and connections."""
 MAX_OPEN: dict[CountedKind, int] = {"unfinished": 16, "stream": 128, "open": 256}
-"""A browser sends requests whole, so 16 incomplete ones are many even for a classroom behind one address."""
+"""A browser sends requests whole, so 16 incomplete requests are many even for a classroom behind one address."""
 
 
 class AddressLimits:
@@ -19,7 +19,7 @@ class AddressLimits:
         self._counts: Counter[tuple[CountedKind, str]] = Counter()
 
     def can_open(self, kind: CountedKind, address: str) -> bool:
-        """Return whether the address may open one more."""
+        """Return whether the address may open one more of ``kind``."""
         return self._counts[kind, address] < self._max_open[kind]
 
     def count(self, kind: CountedKind, address: str, by: int) -> None:

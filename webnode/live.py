@@ -1,7 +1,7 @@
 """Serve the state (server-sent events) and the cameras (long polling) as native Twisted resources.
 
 A stream would occupy a WSGI worker until its end, so streams bypass Flask.  Nothing is queued for a client that
-reads slowly: it is skipped, and later gets the changes that it missed, or the whole state if that is smaller.
+reads slowly: the client later gets the changes that it missed, or the whole state if that is smaller.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from webnode.state_journal import Journal, encode_json
 BEAT_S = 0.2
 CHANGES_INTERVAL_S = 0.1
 READ_PAUSE_FACTOR = 4
-"""For a large team, pause between two readings of the state as a multiple of the time that one takes."""
+"""For a large team: pause between two readings of the state, as a multiple of the duration of a reading."""
 CHECK_S = 1.0
 """Interval in seconds at which the sessions of open streams are checked."""
 RENEWAL_LEAD_S = 3600.0
@@ -150,7 +150,9 @@ class EventStreams(JsonResource):
     def render_GET(self, request: Request) -> int | bytes:
         """Open a stream."""
         if len(self._viewers) >= MAX_VIEWERS:
-            return write_refusal(request, Refusal("events", "too many open pages", "close one and try again", 503))
+            return write_refusal(
+                request, Refusal("events", "there are too many open pages", "close a page and try again", 503)
+            )
         request.setHeader("Content-Type", "text/event-stream; charset=utf-8")
         request.setHeader("Cache-Control", "no-store")
         request.setHeader("X-Accel-Buffering", "no")
@@ -211,7 +213,7 @@ class EventStreams(JsonResource):
                 viewer.request.write(text.encode())
 
     def _check_session(self, viewer: Viewer) -> bool:
-        """End the stream of an expired session; announce the expiry of one that can be renewed."""
+        """End the stream of an expired session; announce the expiry of a session that can be renewed."""
         now = self._wall()
         user = self._services.sessions.authenticate(viewer.ticket, now)
         if user.role == "anyone":
@@ -275,7 +277,7 @@ class EventStreams(JsonResource):
         return self._encoded[1]
 
     def _make_latest_events(self, viewer: Viewer, latest: Mapping[str, str]) -> str:
-        """Return the events of which only the newest counts, if the viewer has not received them yet."""
+        """Return the newest of each event that replaces earlier ones, if the viewer has not received it yet."""
         fresh = {event: text for event, text in latest.items() if viewer.sent_latest.get(event) != text}
         viewer.sent_latest |= fresh
         return "".join(_format_event(event, text) for event, text in fresh.items())
@@ -323,7 +325,7 @@ def read_token(request: Request) -> str:
 
 
 class CameraImages(JsonResource):
-    """``/shot/<device>?after=N&viewer=V``: the newest picture whose number is not N, as soon as there is one.
+    """``/shot/<device>?after=N&viewer=V``: the newest picture, as soon as its number is not N.
 
     The response has the number in ``X-Seq``, to be used as the next ``after``; it is 204 after five seconds without a
     new picture.  A second request of the same viewer ends its first with 204, so one picture is in flight per viewer.
@@ -345,7 +347,7 @@ class CameraImages(JsonResource):
         return _CameraImage(self, path.decode("ascii", "replace"))
 
     def serve(self, uuid: str, request: Request) -> int | bytes:
-        """Answer at once if the newest picture is new to the viewer, else with the next one."""
+        """Answer immediately if the newest picture is new to the viewer, otherwise with the next picture."""
         camera = self._cameras.get(uuid)
         if camera is None:
             try:
@@ -357,7 +359,7 @@ class CameraImages(JsonResource):
             self._cameras[uuid] = camera
         if len(camera.waiting) >= MAX_WAITING:
             return write_refusal(
-                request, Refusal("shot", "too many viewers of this camera", "close one and try again", 503)
+                request, Refusal("shot", "there are too many viewers of this camera", "close a page and try again", 503)
             )
         camera.wait(request)
         return NOT_DONE_YET

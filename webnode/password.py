@@ -18,7 +18,7 @@ SALT_BYTES, HASH_BYTES = 16, 32
 MIN_LENGTH, MAX_LENGTH = 8, 200
 """Length limits of a password, in characters."""
 CODE_LETTERS = "abcdefghjkmnpqrstuvwxyz"
-"""Letters of a code; none resembles another or a digit."""
+"""Letters of a code; they are easy to tell apart from each other and from digits."""
 
 
 def draw_code(rng: random.Random) -> str:
@@ -43,10 +43,10 @@ def parse_hash(text: str) -> tuple[int, int, int, bytes, bytes]:
     """Parse a hash; raises ``ValueError`` if it is invalid or needs too much memory."""
     kind, *figures, salt, digest = text.split("$")
     if kind != "scrypt" or len(figures) != 3:
-        raise ValueError("it does not start with scrypt and three numbers")
+        raise ValueError("the hash does not start with scrypt and three numbers")
     log_n, r, p = (int(figure) for figure in figures)
     if not (1 <= log_n <= 20 and 1 <= r <= 32 and 1 <= p <= 16 and 128 * r * 2**log_n <= MEMORY_BYTES // 2):
-        raise ValueError("its numbers are out of range")
+        raise ValueError("the numbers of the hash are out of range")
     return log_n, r, p, _decode_base64(salt), _decode_base64(digest)
 
 

@@ -16,7 +16,7 @@ from webnode.errors import Refusal
 MAX_BODY = 64 * 1024
 LOCAL_SUFFIXES = (".localhost", ".local", ".lan", ".internal", ".home.arpa")
 HEADERS = {
-    # A page that has lost its node connects to other web nodes of the team, whose addresses this node may not know.
+    # A page that has lost its node connects to other web nodes, whose addresses this node may not know.
     "Content-Security-Policy": (
         "default-src 'self'; connect-src 'self' http: https:; "
         "object-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -89,12 +89,12 @@ def find_refusal(
     """
     if not is_own_host(host, names):
         return Refusal(
-            "Host", "unknown name of this node", "use the node's address, or add the name to [web] names", 403
+            "Host", "the name is not a name of this node", "use the node's address, or add the name to [web] names", 403
         )
     if method in ("GET", "HEAD"):
         return None
     if not is_own_origin(origin, host) and not is_allowed_origin(origin or ""):
-        return Refusal("Origin", "request from another site", "use the node's own page", 403)
+        return Refusal("Origin", "the request comes from another site", "use the node's own page", 403)
     if method != "OPTIONS" and not has_csrf_header:
         return Refusal("X-Swarm", "the header is missing", "send 'X-Swarm: 1' or JSON with its content type", 403)
     return None
@@ -108,6 +108,6 @@ def make_headers(host: str, origin: str | None, is_allowed_origin: IsAllowedOrig
 
 
 def choose_token(authorization: str, ticket: str) -> str:
-    """Return the token of the Authorization header, else the ticket of the query, else an empty text."""
+    """Return the token of the Authorization header, otherwise the ticket of the query, otherwise an empty string."""
     kind, _, token = authorization.partition(" ")
     return token.strip() if kind.lower() == "bearer" and token.strip() else ticket

@@ -14,10 +14,10 @@ class JsonResource(Resource):
     """A resource that answers ``methods``; other methods and unknown paths below it are refused as JSON."""
 
     methods: tuple[bytes, ...] = (b"GET",)
-    """The supported methods; streams leave out HEAD, as such a request would not end."""
+    """The supported methods; streams do not support HEAD, because the request would not end."""
 
     def getChild(self, path: bytes, request: Request) -> Resource:
-        """Refuse a path below this resource."""
+        """Reject a path below this resource."""
         return RefusedResource(
             Refusal(get_path(request), "not found", "see docs/reference/http-api.md for the routes", 404)
         )
@@ -46,7 +46,7 @@ class RefusedResource(Resource):
         self._refusal = refusal
 
     def render(self, request: Request) -> bytes:
-        """Answer with the refusal."""
+        """Send the refusal."""
         return write_refusal(request, self._refusal)
 
 

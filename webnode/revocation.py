@@ -49,7 +49,7 @@ class TeamRevocations(Revocations):
         self._watch = node.entangled.watch(REVOKED_KEY, self._on_records, keep=True)
 
     def revoke(self, token_id: str, until: float) -> None:
-        """Revoke a session here, and publish that to the other web nodes."""
+        """Revoke a session here, and publish the revocation to the other web nodes."""
         self._add_known({token_id: until})
         own = {each: end for each, end in self._own.items() if end > self._node.wall()}
         self._own = _select_newest({**own, token_id: until}, MAX_PUBLISHED)
@@ -63,8 +63,8 @@ class TeamRevocations(Revocations):
             self._add_known(read_revocations(record))
 
     def _add_known(self, ends: Mapping[str, float]) -> None:
-        # A revocation stays valid when its publisher leaves.  The table is replaced, never modified, as other threads
-        # read it.
+        # A revocation stays valid when its publisher leaves.  The table is replaced, never modified, because other
+        # threads read it.
         now = self._node.wall()
         known = {each: end for each, end in self._known.items() if end > now}
         self._known = _select_newest({**known, **{each: end for each, end in ends.items() if end > now}}, MAX_KNOWN)
@@ -85,5 +85,5 @@ def _select_newest(ends: Mapping[str, float], max_count: int) -> dict[str, float
 
 
 def _ignore_failure(failure: Any) -> None:
-    """Ignore that no replica could be reached: the revocation is valid here."""
+    """Ignore the failure: no replica could be reached, but the revocation is valid at this node."""
     failure.trap(EntangledError)

@@ -1,7 +1,7 @@
 """Describe a route of the API as data, and check requests against it.  Pure.
 
 A route lists the fields of its path, query and body.  ``check_request`` converts a request or refuses it with the name
-of the field.  A handler gets a ``RouteRequest`` and knows neither HTTP nor Flask.
+of the field.  A handler gets a ``RouteRequest`` and depends neither on HTTP nor on Flask.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from webnode.state import GONE, State
 API = "/api/v1"
 MAX_NUMBER = 1e9
 REQUIRED: Any = object()
-"""The default of a field that has to be given."""
+"""The default of a required field."""
 ALLOWED_ROLES: Mapping[Role, tuple[Role, ...]] = {
     "anyone": ("anyone", "viewer", "operator", "phone"),
     "viewer": ("viewer", "operator", "phone"),
@@ -90,8 +90,8 @@ class Content:
 class Route:
     """One route of the API.
 
-    With ``handler`` None the route is served by a Twisted resource, made by ``native`` or by ``server``, instead of
-    Flask.  ``limit_s`` replaces the usual time limit of an answer; ``body_type`` is the media type of a native body.
+    If ``handler`` is None, not Flask but a Twisted resource serves the route, made by ``native`` or by ``server``.
+    ``limit_s`` replaces the usual time limit of an answer; ``body_type`` is the media type of a native body.
     """
 
     method: Literal["GET", "POST", "PUT", "DELETE"]
@@ -125,7 +125,7 @@ def check_role(role: Role, user: User) -> None:
 def check_request(route: Route, path: Mapping[str, str], query: Mapping[str, str], body: object) -> dict[str, Any]:
     """Return the values by field name; raises ``Refusal`` with the field, the problem and the remedy."""
     if not isinstance(body, Mapping):
-        raise Refusal("body", "it is not a JSON object", 'send something like {"name": "value"}')
+        raise Refusal("body", "the body is not a JSON object", 'send something like {"name": "value"}')
     places: dict[str, Mapping[str, Any]] = {"path": path, "query": query, "body": body}
     known = {field.name for field in route.fields if field.where == "body"}
     for name in body:
@@ -138,7 +138,7 @@ def check_request(route: Route, path: Mapping[str, str], query: Mapping[str, str
             value = place[field.name]
             values[field.name] = _convert_field(field, value if field.where == "body" else _convert_text(field, value))
         elif field.default is REQUIRED:
-            raise Refusal(field.name, "it is missing", f"give {field.description}")
+            raise Refusal(field.name, "the field is missing", f"send {field.description}")
         else:
             values[field.name] = field.default
     return values
@@ -150,13 +150,13 @@ def find_device(request: RouteRequest) -> State:
     if not found:
         raise Refusal("device", "unknown device", f"choose one of {API}/devices", 404)
     if found[0]["status"] == GONE:
-        raise Refusal("device", f"{found[0]['name']} has left the network", "wait until it is back", 409)
+        raise Refusal("device", f"{found[0]['name']} has left the network", "wait until the device is back", 409)
     return dict(found[0])
 
 
 def _suggest_field(name: object, known: Collection[str]) -> str:
     near = f"the nearest is {find_nearest(str(name), known)}" if known else "this route takes no fields"
-    return f"leave it out; {near}"
+    return f"remove the field; {near}"
 
 
 def _convert_text(field: Field, text: str) -> object:
@@ -173,7 +173,7 @@ def make_type_hint(field: Field) -> Any:
     """Return the type of a field with its bounds, for conversion and documentation."""
     minimum, maximum = field.minimum, field.maximum
     match field.kind:
-        case "text":  # may be a password, so errors must not repeat it
+        case "text":  # the value may be a password, so errors must not repeat it
             return Annotated[
                 str,
                 Meta(min_length=int(1 if minimum is None else minimum), max_length=_get_max_length(field)),

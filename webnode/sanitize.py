@@ -41,20 +41,20 @@ def clean_count(value: object, fallback: int = 0) -> int:
 
 
 def clean_distance(value: object) -> float | None:
-    """Return ``value`` if it is a finite length of zero or more, else None: not measured."""
+    """Return ``value`` if it is a finite length of zero or more; otherwise None (not measured)."""
     length = clean_number(value, -1.0)
     return length if length >= 0.0 else None
 
 
 def clean_texts(value: object) -> list[str]:
-    """Return the valid texts of a list."""
+    """Return the valid strings of a list."""
     if not isinstance(value, list | tuple):
         return []
     return [entry for entry in (clean_text(each) for each in value[:MAX_ENTRIES]) if entry]
 
 
 def clean_properties(value: object) -> dict[str, dict[str, str | float]]:
-    """Map capability names to properties, each a number or a text; other properties are left out."""
+    """Map capability names to properties, each a number or a string; other properties are left out."""
     found: dict[str, dict[str, str | float]] = {}
     if not isinstance(value, Mapping):
         return found

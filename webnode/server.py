@@ -63,7 +63,7 @@ def make_caller(reactor: Any, usual_s: float = CALL_LIMIT_S) -> OnReactor:
         try:
             outcome = answers.get(timeout=usual_s if limit_s is None else limit_s)
         except Empty:
-            raise Refusal("node", "no answer in time", "check the state, then try again", 503) from None
+            raise Refusal("node", "the node did not answer in time", "check the state, then try again", 503) from None
         if isinstance(outcome, Failure):
             outcome.raiseException()
         return outcome
@@ -222,7 +222,11 @@ def open_port(reactor: Any, host: str, port: int, factory: Any, setting: str) ->
     except CannotListenError as error:
         why = getattr(error.socketError, "strerror", None) or str(error.socketError)
         is_foreign = getattr(error.socketError, "errno", None) == errno.EADDRNOTAVAIL
-        remedy = "set host to an address of this machine" if is_foreign else f"choose another {setting}, or 0"
+        remedy = (
+            "set host to an address of this machine"
+            if is_foreign
+            else f"set {setting} to another port, or to 0 for any free port"
+        )
         raise PortTaken(f"cannot serve the page on {host or '*'}:{port} ({why}); {remedy}") from error
     return opened
 
@@ -326,6 +330,6 @@ class WebService(Service):
         self._listening, self._secure_ports = None, []
         self._events.close()
         self._camera_images.close()
-        # Runs on another thread, as a worker may be waiting for the reactor.
+        # Runs on another thread, because a worker may be waiting for the reactor.
         closed.append(deferToThreadPool(self._reactor, self._reactor.getThreadPool(), self._pool.stop))
         return gatherResults(closed).addCallback(lambda _: None)

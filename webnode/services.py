@@ -55,7 +55,7 @@ class Phones(Protocol):
 
 @dataclass
 class Services:
-    """The services of one web node; a service that the node lacks is None, and ``feature_names`` tells the page so."""
+    """The services of one web node; a service that the node lacks is None, and ``feature_names`` does not list it."""
 
     control: TeamControl
     sessions: Sessions

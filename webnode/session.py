@@ -32,17 +32,17 @@ PEER_TOKEN_S = 600.0
 """Validity in seconds of a token for another web node, at which the page renews it."""
 FREE_EVERYWHERE, LONGEST_EVERYWHERE_S, FORGOTTEN_EVERYWHERE_S = 100, 60.0, 3600.0
 """Failed attempts of all addresses together: 100 are free, then one per minute is allowed, until an hour passes without
-any.  The pause is short, as it delays every address that has not signed in before."""
+a failure.  The pause is short, because it delays every address that has not signed in before."""
 ALL_SOURCES = "everywhere"
 MAX_CHECKS, MAX_WAITING_CHECKS = 2, 1
-"""Number of passwords checked at the same time, and of those waiting: each occupies one of the page's four workers, and
-guesses must not occupy all."""
+"""Number of passwords checked at the same time, and of passwords that wait.  Each check occupies one of the page's four
+workers, and guesses must not occupy all of them."""
 
 ANONYMOUS = User()
 NO_GATEWAY = Refusal(
     "node",
-    "it has no role gateway in its team, so it cannot sign anyone in",
-    "sign in at another web node, or let the operator run: swarm promote NAME --role gateway",
+    "this node lacks the role gateway in its team, so it cannot sign users in",
+    "sign in at another web node, or ask the operator to run: swarm promote NAME --role gateway",
     403,
 )
 Check = Callable[[str, str], Deferred[bool]]
@@ -91,14 +91,14 @@ class SignedSessions:
             return succeed(self._begin(invited.name, invited.role, now, invited.until, invited))
         wait = self._attempts.get_wait(source, now)
         if wait > 0.0:
-            return fail(Refusal("code", "too many wrong attempts", f"wait {math.ceil(wait)} s", 429))
+            return fail(Refusal("code", "there were too many wrong attempts", f"wait {math.ceil(wait)} s", 429))
         self._attempts.count_attempt(source, now)
         if hmac.compare_digest(_normalize_code(proof), _normalize_code(self.code)):
             return succeed(self._begin_operator(source, now))
         if not self._password:
             return fail(_make_wrong_code())
         if len(self._gate.waiting) >= MAX_WAITING_CHECKS:
-            return fail(Refusal("code", "too many sign-ins at once", "try again in a few seconds", 503))
+            return fail(Refusal("code", "there are too many simultaneous sign-ins", "try again in a few seconds", 503))
 
         def finish(is_right: bool) -> Token:
             if not is_right:
@@ -136,7 +136,7 @@ class SignedSessions:
         return self._sign(replace(token, limit=token.until, parents=_list_session_ids(user)))
 
     def renew_token(self, user: User, now: float) -> Token:
-        """Return another token for the same session; revoking one ends both."""
+        """Return another token for the same session; revoking either token ends the session."""
         _require_session(user)
         return self._make_session_token(user, now + self.session_s, user.limit)
 
@@ -158,7 +158,7 @@ class SignedSessions:
         return self._begin("operator", "operator", now, now + MAX_SESSION_S)
 
     def _begin(self, name: str, role: Role, now: float, limit: float, invited: User = ANONYMOUS) -> Token:
-        """Start a session, which ends with the invitation that it was made from."""
+        """Start a session, which ends together with the invitation from which it was made."""
         user = User(name, role, self._draw_id(), parents=_list_session_ids(invited), vouchers=invited.vouchers)
         return self._make_session_token(user, now + self.session_s, limit)
 
@@ -174,7 +174,7 @@ class SignedSessions:
         """Return the other web nodes that vouch for ``user``; raises ``Refusal`` if there are too many."""
         others = tuple(each for each in user.vouchers if each != self.key.public)
         if len(others) > MAX_VOUCHERS:
-            raise Refusal("Authorization", "the session used too many web nodes", "sign in here", 401)
+            raise Refusal("Authorization", "the session used too many web nodes", "sign in at this node", 401)
         return others
 
     def _draw_id(self) -> str:
@@ -225,8 +225,8 @@ def make_sessions(
     key = TokenKey(node.entangled.identity)
     if not web.sign_in:
         if not is_loopback(web.host):
-            problem = f"is false, and {web.host} serves more than this machine"
-            raise BadSetting(origin, "[web] sign_in", problem, "set host = '127.0.0.1', or leave sign_in out")
+            problem = f"is false, but the page at {web.host} is open to other machines"
+            raise BadSetting(origin, "[web] sign_in", problem, "set host = '127.0.0.1', or remove sign_in")
         return OpenSessions(lambda: team.can_authenticate(key.public))
     if web.password:
         try:
@@ -253,7 +253,7 @@ def _normalize_code(code: str) -> bytes:
 
 
 def _list_session_ids(user: User) -> tuple[str, ...]:
-    """Return the ids of the sessions with which everything started by ``user`` ends."""
+    """Return the ids of the sessions whose end also ends all sessions and tokens that ``user`` starts."""
     return tuple(each for each in (user.token_id, *user.parents) if each)[:MAX_PARENTS]
 
 

@@ -35,7 +35,7 @@ class SignInDelays:
         return max(0.0, min(pause, last + pause - now))
 
     def count_attempt(self, source: str, now: float) -> None:
-        """Count an attempt before its outcome is known, so that concurrent attempts all count."""
+        """Count an attempt before its outcome is known, so concurrent attempts are counted, too."""
         key = get_network(source)
         count, last = self._attempts.pop(key, (0, now))
         self._attempts[key] = (1 if now - last >= self._forgotten_s else count + 1, now)
@@ -47,7 +47,7 @@ class SignInDelays:
         self._attempts.pop(get_network(source), None)
 
     def uncount_attempt(self, source: str) -> None:
-        """Uncount the last attempt of ``source``: it succeeded, which says nothing about the earlier ones."""
+        """Uncount the last attempt of ``source``: it succeeded, but the earlier attempts still count."""
         key = get_network(source)
         if key in self._attempts:
             count, last = self._attempts[key]
@@ -55,7 +55,7 @@ class SignInDelays:
 
 
 def get_network(source: str) -> str:
-    """Return the network that counts as one source: the /64 of an IPv6 address, since a client owns all of it."""
+    """Return the network that counts as one source: the /64 of an IPv6 address, because a client has the whole /64."""
     try:
         address = ipaddress.ip_address(source.partition("%")[0])
     except ValueError:

@@ -48,7 +48,7 @@ def format_state(
     titles = {view["id"]: view["title"] for view in listed}
     for view in shown:
         view["objective"] = titles.get(view["task"], view["task"])
-    # A winner that has just failed no longer reports, but the standbys still name it.
+    # A winner that has just failed no longer reports, but the reports of the standbys still contain it.
     names = {view["uuid"]: view["name"] for view in shown}
     order = {view["id"]: place for place, view in enumerate(listed)}
     keys = sorted((key for key in groups if groups[key]), key=lambda key: (order.get(key, len(order)), key))
@@ -116,9 +116,9 @@ def make_task_view(fields: Fields) -> State:
 def make_group_view(task: str, title: str, members: Sequence[Fields], known: Mapping[str, str] | None = None) -> State:
     """Return the consensus point of one group: the winner that each agent computed, and whether they agree.
 
-    The point is the agent named most often (of equals, the lowest uuid).  ``differ`` lists the members that named
-    another agent, ``undecided`` the members without a choice yet.  ``known`` names devices without a report (uuid to
-    name).  ``share`` is the cost (metres) relative to the largest.
+    The point is the agent that most members computed (among equals, the lowest uuid).  ``differ`` lists the members
+    with a different winner, ``undecided`` the members that have none yet.  ``known`` names devices without a report
+    (uuid to name).  ``share`` is the cost (metres) relative to the largest.
     """
     views = [_make_member_view(member) for member in members]
     views.sort(key=lambda view: (view["name"], view["uuid"]))
@@ -147,7 +147,7 @@ def make_group_view(task: str, title: str, members: Sequence[Fields], known: Map
 
 
 class DepartedDevices:
-    """Keeps devices that left for some time, so that the page shows them as gone."""
+    """Keeps devices for some time after they have left, so that the page shows them as gone."""
 
     def __init__(self, shown_s: float = DEPARTED_SHOWN_S) -> None:
         self._shown_s = shown_s
@@ -155,7 +155,7 @@ class DepartedDevices:
         self._gone: dict[str, State] = {}
 
     def update(self, devices: Iterable[Fields], now: float) -> list[State]:
-        """Return the devices that left recently; ``gone`` is the unix time at which this was seen.
+        """Return the devices that left recently; ``gone`` is the unix time at which this was noticed.
 
         Safe to call from several threads: each call replaces the stored tables and modifies nothing in place.
         """

@@ -17,7 +17,7 @@ from webnode.state import GONE, DepartedDevices, State, format_state
 
 MAX_TASKS = 20
 MAX_LISTED_STOPS = 64
-"""Maximum number of stops listed; when these are released, the next ones are listed."""
+"""Maximum number of stops listed; further stops are listed when these are released."""
 MAX_AGE_S = 0.1
 """Maximum age of a cached state in seconds; it bounds the work when many clients ask at once."""
 
@@ -101,11 +101,11 @@ def _make_stop_view(stops: Mapping[str, str], devices: Iterable[State]) -> State
     ``halted`` is true only if every robot confirms that it stands still for every stop in force.  A stop that is
     ordered but not confirmed is shown as such, and so is a robot that has not received a release.  ``stops`` (id to
     operator) are the stops that the team knows; ``devices`` are the rows of the page.  The last report of a robot that
-    left counts, as it stands still until it receives a release.
+    left still applies, because the robot stands still until it receives a release.
     """
     robots = [row for row in devices if row["capabilities"]]
     standing = [row for row in robots if _is_standing(row, stops)]
-    # A robot may obey a stop whose records have expired: it is listed, as otherwise no operator could release it.
+    # A robot may obey a stop whose records have expired.  List this stop, so that an operator can release it.
     known = {**dict.fromkeys((stop for row in robots for stop in row["stops"]), ""), **stops}
     others = [{"name": row["name"], "says": _describe_stop(row)} for row in robots if row not in standing]
     return {

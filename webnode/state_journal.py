@@ -1,7 +1,7 @@
 """Number the changes between successive states of the team, and keep the newest.  Pure.
 
 A page that reconnects after a short interruption gets the changes that it missed; otherwise it gets the whole state.
-Change numbers are valid for one node and one run of it, named by ``epoch``.
+Change numbers are valid for one process run of one node, which ``epoch`` identifies.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from webnode.errors import Refusal
 
 
 class StopControl:
-    """Stops the whole team through ``client``; results map each uuid to ``stands`` or to the reason why it does not."""
+    """Stops the team through ``client``; results map each uuid to ``stands`` or to the reason why it does not stand."""
 
     def __init__(self, client: TeamClient) -> None:
         self._client = client
@@ -23,7 +23,7 @@ class StopControl:
         return self._client.stop_all(by)
 
     def release(self, by: str, stops: Sequence[str] | None = None) -> Deferred[dict[str, str]]:
-        """End the stops ``stops``, or else all that this node or a device knows; raises ``Refusal`` for a bad id."""
+        """End the given stops, by default all that this node or a device knows; raises ``Refusal`` for a bad id."""
         named = self._list_known() if stops is None else [_parse_id(stop) for stop in stops]
         return self._client.release(named, by)
 
@@ -40,5 +40,5 @@ def is_stop_id(stop: str) -> bool:
 
 def _parse_id(stop: object) -> bytes:
     if not isinstance(stop, str) or not is_stop_id(stop):
-        raise Refusal("stops", "invalid id of a stop", "use ids of /api/v1/state, or leave it out")
+        raise Refusal("stops", "a stop has an invalid id", "use ids of /api/v1/state, or omit the field")
     return bytes.fromhex(stop)

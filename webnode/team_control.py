@@ -51,7 +51,7 @@ class SimulatorControl(Protocol):
 class TeamControl:
     """An operator's access to a running team; ``predefined`` and ``demo`` come from the catalogue of tasks.
 
-    Every method is called on the reactor's thread and returns at once, or returns a Deferred that fires soon.  It
+    Every method is called on the reactor's thread and returns immediately, or returns a Deferred that fires soon.  It
     raises ``Refusal`` for an impossible request; the effect of a request shows in the state, not in the answer.
     """
 
@@ -107,11 +107,11 @@ class TeamControl:
         return self._start_demo(self._client.new_task_id())
 
     def assign(self, name: str, tolerates: int = 1, group: str = "", task_id: str = "") -> Any:
-        """Publish a predefined task; ``tolerates`` members of its council may fail at once.
+        """Publish a predefined task; ``tolerates`` members of its council may fail at the same time.
 
-        Tasks of one ``group`` are divided together.  Returns ``{"id", "able": [names], "refused": {name: [reasons]}}``.
-        With ``task_id`` it returns a Deferred, and does not publish a task that exists, as another web node may have
-        published it for the same request.
+        Tasks of one ``group`` are assigned jointly, one to each device.  Returns ``{"id", "able": [names], "refused":
+        {name: [reasons]}}``.  With ``task_id`` it returns a Deferred, and does not publish a task that exists, because
+        another web node may have published it for the same request.
         """
         template = replace(self._find_template(name, group), tolerates=tolerates)
         if task_id:
@@ -124,7 +124,7 @@ class TeamControl:
 
         ``{"able": [{"uuid", "name", "busy"}], "refused": {name: [reasons]}, "likely": name | None, "together": [{"id",
         "title"}]}``; ``busy`` is the current task of a device, ``likely`` the device that would probably take it by
-        present reports, ``together`` the open tasks of ``group`` that it would be divided with.
+        present reports, ``together`` the open tasks of ``group`` that would be assigned jointly with it.
         """
         task = self._find_template(name, group)
         refused = self._view.find_unable_devices(task)
@@ -134,7 +134,7 @@ class TeamControl:
             {"uuid": d.uuid, "name": d.name, "busy": titles.get(d.task, "another task" * bool(d.task))} for d in able
         ]
         likely = self._find_likely(task, [device.uuid for device in able])
-        # The same rule as the agents': tasks of one group with equal requirements and strategy are divided together.
+        # The agents' rule: tasks of one group with equal requirements and strategy are assigned jointly.
         together = [
             {"id": other.task_id, "title": other.title}
             for other in self._view.open_tasks
@@ -218,7 +218,7 @@ class TeamControl:
             self.cancel(task.task_id)
         if self._simulator is not None:
             self._log_failure(self._simulator.clear_target())
-            # The simulator places it, as this node may fail before.
+            # The simulator starts the timer for the target itself, because this node may fail before it expires.
             self._log_failure(self._simulator.place_target_later(PLACE_TARGET_S))
         # The acting device may fail together with the node that serves the page.
         template = replace(self._find_template(self._demo), tolerates=2)
@@ -270,10 +270,10 @@ class TeamControl:
         silent: Deferred[Any] = Deferred()
 
         def decide() -> None:
-            remedy = "check whether the order took effect, then try again"
+            remedy = "check whether the request took effect, then try again"
             refusal = Refusal("device", f"{name} did not answer", remedy, 504)
             if self._view.find_device(uuid) is None:
-                refusal = Refusal("device", f"{name} left during the request", "wait until it is back", 409)
+                refusal = Refusal("device", f"{name} left during the request", "wait until the device is back", 409)
             silent.errback(refusal)
 
         # The device's presence record outlives it for a moment; its expiry tells a departure from silence.
@@ -282,7 +282,12 @@ class TeamControl:
 
     def _require_simulator(self) -> SimulatorControl:
         if self._simulator is None:
-            raise Refusal("target", "this node has no robot simulator", "start one, or name it in the settings", 409)
+            raise Refusal(
+                "target",
+                "this node has no robot simulator",
+                "start a simulator, and set its address in [web] yard",
+                409,
+            )
         return self._simulator
 
     def _log_failure(self, work: Deferred[Any]) -> None:

@@ -1,7 +1,7 @@
 """Serve the page over TLS on a second port, with a certificate that the node creates, stores and renews.
 
-Both ports serve the same site with the same deadlines.  These start with the connection, so a client that is slow with
-its handshake is disconnected as well.  This module loads pyOpenSSL and is imported only if TLS is used.
+Both ports serve the same site with the same deadlines.  The deadlines start with the connection, so a client that is
+slow with its handshake is disconnected as well.  This module loads pyOpenSSL and is imported only if TLS is used.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _log = Logger()
 class CertificateProvider:
     """The certificate for connections: from the file, or a new one.
 
-    With ``path`` None it is not stored.  ``wall`` returns unix time, ``names`` the names of this machine.
+    If ``path`` is None, the certificate is not stored.  ``wall`` returns unix time, ``names`` this machine's names.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class CertificateProvider:
         self._rng = rng
         self._reached: list[str] = []
         self._checked_at = 0.0
-        self._leaf = self._load() or self._create("there is none yet")
+        self._leaf = self._load() or self._create("no certificate exists yet")
         self._options: Any = None
 
     @property
@@ -83,7 +83,7 @@ class CertificateProvider:
     def serverConnectionForTLS(self, protocol: object) -> Connection:  # noqa: N802
         """Return the TLS state of the next connection."""
         now = self._wall()
-        # Check again also if the clock was set back.
+        # Also check again if the clock was set back.
         if not 0.0 <= now - self._checked_at < CHECK_S:
             self._checked_at = now
             flaw = self._leaf.find_flaw(self._signer, self._required_names(), now)

@@ -1,8 +1,8 @@
 """Sign and verify session tokens, each issued by a web node for one web node.  Pure.
 
 A web node signs with the identity of its node: an Ed25519 key, which has the role ``gateway`` from the operator of a
-closed team.  So members without that role cannot issue valid tokens, and a secret that all members share is of no use
-for it.  Signing and encoding use ``itsdangerous``.
+closed team.  So members without that role cannot issue valid tokens, and a secret that all members share is not enough
+to issue a token.  Signing and encoding use ``itsdangerous``.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Claim:
 
     @property
     def ticket(self) -> Claim:
-        """The same session with fewer rights, as URLs leak more easily: an operator's ticket only reads."""
+        """A claim of the same session that can only read, because URLs leak more easily than headers."""
         return replace(self, role="phone" if self.role == "phone" else "viewer", is_ticket=True)
 
 
@@ -84,7 +84,7 @@ class TokenKey:
     def sign_token(self, claim: Claim, audience: bytes = b"") -> str:
         """Return the token of ``claim`` for the node with the id ``audience``, by default for this one.
 
-        It consists of letters, digits, ``-``, ``_`` and ``.``.  A token for this node does not name it.
+        It consists of letters, digits, ``-``, ``_`` and ``.``.  A token for this node has no audience.
         """
         is_own = audience in (b"", self.node_id)
         value = base64_encode(encode_claim(claim, b"" if is_own else audience))
@@ -111,7 +111,7 @@ class TokenKey:
 
 
 def _make_signer(public: bytes, algorithm: Ed25519) -> Signer:
-    # No key derivation: the algorithm is asymmetric, and the key names the signer.
+    # No key derivation: the algorithm is asymmetric, and the key identifies the signer.
     return Signer(public, key_derivation="none", algorithm=algorithm)
 
 

@@ -226,8 +226,15 @@ def make_parser(prog: str, description: str) -> argparse.ArgumentParser:
 
 
 def _parse_arguments(arguments: Sequence[str]) -> argparse.Namespace:
-    parser = make_parser("swarm demo", "Three robots, a red target and the page.")
-    parser.add_argument("--headless", action="store_true", help="run and check both experiments, exit with 0 or 1")
+    parser = make_parser(
+        "swarm demo",
+        "Run three robots, a red target and the page on this machine, until Ctrl-C.  Example: swarm demo --robot sim",
+    )
+    parser.add_argument(
+        "--headless",
+        action="store_true",
+        help="run both experiments, check them, and exit with 0 (passed) or 1 (failed)",
+    )
     parser.add_argument("--web-host", default=LOOPBACK, help="address of the page; 0.0.0.0 opens it to the network")
     parser.add_argument(
         "--web-port",

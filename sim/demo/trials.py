@@ -194,11 +194,27 @@ def parse_count(text: str) -> int:
 
 def main(arguments: Sequence[str], make_team: MakeTeam) -> int:
     """Run the command line; returns 0 if every trial passed."""
-    parser = argparse.ArgumentParser(prog="swarm trials", description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--count", type=parse_count, default=20, help="trials of each experiment in virtual time")
-    parser.add_argument("--seed", type=int, default=1, help="the first seed")
-    parser.add_argument("--real", type=parse_count, default=0, help="runs of both experiments with real processes")
-    parser.add_argument("--out", type=Path, default=Path("run/trials"), help="folder for the report and the pictures")
+    parser = argparse.ArgumentParser(
+        prog="swarm trials",
+        description="Repeat both experiments of the thesis with many seeds; write a table, and pictures of each phase.",
+        epilog="Example: swarm trials --count 20 --seed 1",
+    )
+    parser.add_argument(
+        "--count", type=parse_count, default=20, help="trials of each experiment in virtual time (default: %(default)s)"
+    )
+    parser.add_argument("--seed", type=int, default=1, help="seed of the first trial (default: %(default)s)")
+    parser.add_argument(
+        "--real",
+        type=parse_count,
+        default=0,
+        help="runs of both experiments with real processes (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("run/trials"),
+        help="folder for the report and the pictures (default: %(default)s)",
+    )
     parser.add_argument("--pictures", type=parse_count, default=1, help="number of seeds for which pictures are drawn")
     parser.add_argument("--jobs", type=parse_count, default=os.cpu_count() or 1, help="parallel trials")
     args = parser.parse_args(list(arguments))

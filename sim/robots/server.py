@@ -34,10 +34,13 @@ EXIT_USAGE = 2
 def main(arguments: list[str] | None = None, output: TextIO = sys.stdout, errors: TextIO = sys.stderr) -> int:
     """Run a simulator until it is interrupted; return the exit code: 0, or 2 after an error message of one line."""
     parser = argparse.ArgumentParser(
-        prog="swarm yard", description='Simulate robot dogs for the driver "sim" and for emulators.'
+        prog="swarm yard",
+        description='Simulate robot dogs for the driver "sim" and for emulators.  Example: swarm yard --seed 7',
     )
     parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default %(default)s)")
-    parser.add_argument("--port", type=int, default=DEFAULT_PORT, help="TCP port, 0 for any (default %(default)s)")
+    parser.add_argument(
+        "--port", type=int, default=DEFAULT_PORT, help="TCP port, 0: any free port (default %(default)s)"
+    )
     parser.add_argument("--seed", type=int, default=1, help="seed of the random generator (default %(default)s)")
     parser.add_argument("--scene", default="three-dogs", help="a scene's name or a .json file (default %(default)s)")
     parser.add_argument(

@@ -34,7 +34,7 @@ def make_parser() -> argparse.ArgumentParser:
         epilog="Example: swarm doctor dog1.toml",
     )
     doctor.add_argument("settings", nargs="?", metavar="SETTINGS", help="settings file (default: a running node)")
-    doctor.add_argument("--node", metavar="NAME", help="running node on this machine, if several run")
+    doctor.add_argument("--node", metavar="NAME", help="name of the running node, if several run on this machine")
     doctor.add_argument("--json", action="store_true", help="print JSON, on one line")
     return doctor
 
@@ -68,7 +68,7 @@ def main(
 
 
 def _ask_node(name: str | None, ask: SendRequest) -> tuple[dict[str, Any], list[dict[str, Any]]] | None:
-    """Return the health and the links of the running node; None if it does not run."""
+    """Return the health and the links of the running node, or None if no such node runs."""
     try:
         path = find_socket(name)
         answer: list[Any] = []

@@ -13,7 +13,7 @@ NEARLY_FULL_SHARE = 0.9
 
 
 def diagnose(facts: Facts) -> list[Finding]:
-    """Return the problems, most serious first, each cause once."""
+    """Return the problems, the most serious first; a cause is listed once."""
     found = [finding for check in CHECKS for finding in check(facts)]
     if not any(finding.weight == "error" for finding in found):
         found += network_path.check_bootstrap(facts)
@@ -40,7 +40,7 @@ def check_store(facts: Facts) -> Iterator[Finding]:
             "store-unwritable",
             f"The store {storage.path} cannot be written.",
             storage.problem,
-            "Fix that, or set another [node] store.",
+            "Fix this problem, or choose another file in [node] store.",
         )
     elif health is not None and health.trouble:
         yield make_error(
@@ -60,7 +60,7 @@ def check_store(facts: Facts) -> Iterator[Finding]:
             yield (make_error if full else make_warning)(
                 "store-full",
                 f"The node's store is {'full' if full else 'nearly full'}.",
-                f"It holds {used:,} of {most:,} {what}.",
+                f"It contains {used:,} of at most {most:,} {what}.",
                 f"Raise [node] {key}, or add nodes.",
             )
 
@@ -70,9 +70,9 @@ def check_files(facts: Facts) -> Iterator[Finding]:
     for path, mode in facts.open_files:
         yield make_error(
             "key-readable",
-            f"Other users can read {path}, which holds secrets.",
+            f"Other users can read {path}, which contains secrets.",
             f"Its mode is {mode:04o}.",
-            f"Run chmod 600 {path}; if another user may have read it, replace its key.",
+            f"Run chmod 600 {path}; if another user may have read the file, replace its key.",
         )
 
 

@@ -29,10 +29,10 @@ class Answer:
 class Probe:
     """The result of probing one known node over UDP.
 
-    ``answer`` is its reply to a probe for any node; ``is_member`` means that it also replied to a probe for this team.
+    ``answer`` is its reply to a PROBE; ``is_member`` means that it also replied to a DISCOVERY of this team.
     ``error`` is ``refused`` if the machine reported a closed port, ``unreachable`` if there is no route.  ``is_near``:
-    it is in a subnet of this machine; ``is_resolved``: its hardware address was resolved.  ``is_tcp``: it replies to
-    TCP, possibly by a refusal.
+    the node is in a subnet of this machine; ``is_resolved``: its hardware address was resolved.  ``is_tcp``: its
+    machine replies to TCP, even if only with a refusal.
     """
 
     address: Address
@@ -114,7 +114,7 @@ class Facts:
 
     @property
     def answers(self) -> tuple[Answer, ...]:
-        """All replies, known nodes first, each address once."""
+        """All replies, first the replies of known nodes; an address is listed once."""
         found = [probe.answer for probe in self.known if probe.answer is not None]
         found += [] if self.lan is None else list(self.lan.answers)
         return tuple({answer.address: answer for answer in reversed(found)}.values())[::-1]

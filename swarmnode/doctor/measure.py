@@ -1,7 +1,7 @@
 """Measurements for ``swarm doctor``, taken from this machine with separate sockets.
 
-A node replies to a discovery probe (PROBE) of any sender, and to a team probe (DISCOVERY) of a member.  All
-measurements take about two seconds.
+A node replies to a PROBE from any sender, and to a DISCOVERY from a member of its team.  All measurements together
+take about two seconds.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _IP_RECVERR, _IP_PKTINFO, _IP_MULTICAST_ALL = 11, 8, 49
 
 @dataclass
 class Team:
-    """The team of the node: secrets for team probes, fingerprint, certificate, and bootstrap nodes."""
+    """The team of the node: secrets for DISCOVERY, fingerprint, certificate, and bootstrap nodes."""
 
     secrets: Sequence[bytes]
     fingerprint: bytes = bytes(8)
@@ -105,7 +105,7 @@ def measure_facts(
 
 
 def load_team(settings: Settings) -> Team:
-    """Return the team that the settings name."""
+    """Return the team to which the settings belong."""
     path = settings.node.membership
     if not path:
         return Team([settings.node.team_secret])
@@ -115,7 +115,7 @@ def load_team(settings: Settings) -> Team:
     try:
         kept = MembershipFile(Path(path)).membership
         member = kept.member
-    except Exception as error:  # any error in the file is a result of the diagnosis
+    except Exception as error:  # an error in the file is reported as a finding
         return Team([], certificate=Certificate(problem=str(error)))
     mark = hashlib.blake2s(kept.operator, digest_size=8, person=b"team").digest()
     secrets = [secret for _, secret, _ in kept.secrets]
@@ -123,9 +123,10 @@ def load_team(settings: Settings) -> Team:
 
 
 def discover_on_lan() -> list[Answer]:
-    """Return the replies to a discovery probe on the LAN, of any team; takes ``PROBE_COUNT`` x ``PROBE_INTERVAL_S``.
+    """Return the replies of nodes of any team to a PROBE on the LAN, after ``PROBE_COUNT`` x ``PROBE_INTERVAL_S``.
 
-    A newcomer without a team finds bootstrap nodes by this.  In a large team only some nodes reply to each call.
+    In this way a newcomer, which has no team yet, finds bootstrap nodes.  In a large team only some nodes reply to each
+    call.
     """
     return list(_probe_all("*", [], [], select_interfaces(list_interfaces(), "*"), time.time).lan_answers.values())
 
@@ -140,7 +141,7 @@ def _probe_all(
     lan_interfaces: Sequence[Interface],
     wall: Callable[[], float],
 ) -> _Replies:
-    """Probe all known nodes from one socket, so they report the same port; also probe the LAN by ``lan_interfaces``."""
+    """Probe all known nodes from one socket, so their replies are comparable; probe the LAN on ``lan_interfaces``."""
     replies = _Replies()
     rng = random.SystemRandom()
     keys = [derive_key(secret, b"greet") for secret in secrets]
@@ -185,7 +186,7 @@ def _open_sockets(host: str, known: Iterable[Address]) -> dict[int, socket.socke
             try:
                 opened.bind((own, 0))
             except OSError:
-                opened.bind(("", 0))  # another check reports an address that is not of this machine
+                opened.bind(("", 0))  # a separate check reports an address that does not belong to this machine
         except OSError:
             continue
         by_family[family] = opened
@@ -215,7 +216,7 @@ def _send(sockets: dict[int, socket.socket], datagram: bytes, to: Address, repli
     if by is None:
         replies.errors[to] = "unreachable"
         return
-    for _ in range(2):  # an error of an earlier datagram is raised by the next call
+    for _ in range(2):  # raised for an earlier datagram that could not be delivered
         try:
             by.sendto(datagram, to)
             return
@@ -311,7 +312,7 @@ def _make_probe(address: Address, replies: _Replies, found: Sequence[Interface])
 
 
 def _answers_tcp(address: Address) -> bool:
-    """Return whether the machine replies to TCP, possibly by a refusal."""
+    """Return whether the machine replies to TCP, even if only with a refusal."""
     for port in (address.port, TUNNEL_PORT):
         try:
             socket.create_connection((address.host, port), TCP_TIMEOUT_S).close()

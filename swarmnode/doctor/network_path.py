@@ -17,7 +17,7 @@ def check_interface(facts: Facts) -> Iterator[Finding]:
             yield make_error(
                 "wrong-interface",
                 "The node accepts only connections from this machine.",
-                f"[node] host is {facts.host}, and {far[0].address} is on another machine.",
+                f"[node] host is {facts.host}, but {far[0].address} is on another machine.",
                 f"Set [node] host to {_suggest_address(facts)}.",
             )
         return
@@ -43,8 +43,8 @@ def check_interface(facts: Facts) -> Iterator[Finding]:
         yield make_error(
             "wrong-interface",
             f"The interface {at[0].name} is not connected.",
-            f"[node] host {facts.host} is its address, but it has no carrier.",
-            f"Connect it, or set [node] host to {_suggest_address(facts, at[0].name)}.",
+            f"[node] host {facts.host} is the address of this interface, which has no carrier.",
+            f"Connect the interface, or set [node] host to {_suggest_address(facts, at[0].name)}.",
         )
     elif (
         facts.source_address
@@ -53,14 +53,14 @@ def check_interface(facts: Facts) -> Iterator[Finding]:
     ):
         yield make_error(
             "wrong-interface",
-            "The known nodes are reached through another interface than the node's.",
+            "The node does not listen on the interface that reaches the known nodes.",
             f"[node] host is {facts.host} ({at[0].name}), but this machine reaches them from {facts.source_address}.",
             f"Set [node] host to {facts.source_address}.",
         )
 
 
 def check_known_nodes(facts: Facts) -> Iterator[Finding]:
-    """Report the causes for which known nodes do not reply, each once."""
+    """Report why known nodes do not reply; a cause is reported once."""
     silent = [probe for probe in facts.known if not probe.has_reply]
     for probe in [each for each in silent if each.error == "refused"]:
         yield make_warning(
@@ -78,7 +78,7 @@ def check_known_nodes(facts: Facts) -> Iterator[Finding]:
             "udp-blocked",
             "UDP is blocked between this machine and the known nodes.",
             f"{spoken[0].address.host} replies to TCP, but not to UDP.",
-            f"Allow outgoing UDP from port {facts.port or '(all)'}, or set [node] tunnels to a node with one on 443.",
+            f"Allow outgoing UDP from port {facts.port or '(all)'}, or set [node] tunnels to a node with port 443.",
         )
 
 
@@ -99,8 +99,8 @@ def _check_neighbours(facts: Facts, silent: list[Probe]) -> Iterator[Finding]:
         yield make_warning(
             "off",
             f"{hidden[0].address.host} is not on this network now.",
-            "It is in the same subnet, but its hardware does not reply.",
-            "Switch it on, or fix its address in [node] known_nodes.",
+            "Its address is in the same subnet, but its hardware does not reply.",
+            "Switch on that machine, or fix its address in [node] known_nodes.",
         )
     for probe in [each for each in near if each.is_resolved]:
         yield make_error(
@@ -143,7 +143,7 @@ def check_multicast(facts: Facts) -> Iterator[Finding]:
 
 
 def report_nat(facts: Facts) -> Iterator[Finding]:
-    """Report the kind of router between this machine and the others, from the addresses that they see."""
+    """Report the kind of NAT router, judged by the addresses at which other nodes see this machine."""
     seen = [answer.seen for answer in facts.answers if answer.seen is not None]
     seen = [each for each in seen if not is_local(each.host) and each.host not in facts.own_addresses]
     if not seen:
@@ -154,7 +154,7 @@ def report_nat(facts: Facts) -> Iterator[Finding]:
             "nat-symmetric",
             "The router assigns a different port for each peer (symmetric NAT).",
             f"Other nodes see one port of this machine as {', '.join(sorted(f'{h}:{p}' for h, p in ports))}.",
-            "Nodes behind such routers can reach this one by relay only; forward a UDP port to this machine, and set "
+            "Nodes behind such routers can reach this node by relay only; forward a UDP port to this machine, and set "
             "[node] port to it.",
         )
     elif len(seen) > 1:
@@ -169,12 +169,12 @@ def report_nat(facts: Facts) -> Iterator[Finding]:
             "nat",
             "This machine is behind a router with address translation (NAT).",
             f"Other nodes see it at {seen[0]}.",
-            "None; with a second known node the kind of router can be determined.",
+            "None; to determine the kind of router, add a second known node.",
         )
 
 
 def check_bootstrap(facts: Facts) -> Iterator[Finding]:
-    """Report that no bootstrap node is reachable, if no other problem explains it."""
+    """Report that no bootstrap node is reachable, unless another problem explains this."""
     if facts.answers or any(probe.has_reply for probe in facts.known) or (facts.health and facts.health.contacts):
         return
     explained = [probe for probe in facts.known if probe.error or probe.is_resolved is False]
@@ -185,7 +185,7 @@ def check_bootstrap(facts: Facts) -> Iterator[Finding]:
             "no-bootstrap",
             "None of the known nodes replies.",
             f"Probed: {', '.join(str(probe.address) for probe in facts.known)}.",
-            "Start one of them, or fix [node] known_nodes.",
+            "Start one of these nodes, or fix [node] known_nodes.",
         )
     else:
         yield make_warning(

@@ -26,22 +26,26 @@ CAUSE_CODES = {
 
 
 def check_team(facts: Facts) -> Iterator[Finding]:
-    """Check that the nodes found are of this team."""
+    """Check that the nodes found belong to this team."""
     probed = [probe for probe in facts.known if probe.answer is not None and probe.answer.version == VERSION]
     foreign = [probe for probe in probed if not probe.is_member]
     if not foreign or (facts.certificate is not None and facts.certificate.problem):
         return  # no node could be probed as a member of this team
     fingerprint_seen = foreign[0].answer.fingerprint if foreign[0].answer is not None else b""
     if fingerprint_seen != facts.fingerprint and any(fingerprint_seen):
-        why = f"It belongs to the team {fingerprint_seen.hex()}, and this node to {_format_team(facts.fingerprint)}."
-        remedy = "Join that team with a code of its operator (swarm join CODE), or set known_nodes of this team."
+        why = f"That node belongs to the team {fingerprint_seen.hex()}, this node to {_format_team(facts.fingerprint)}."
+        remedy = (
+            "Join that team with a code of its operator (swarm join CODE), or set known_nodes to nodes of this team."
+        )
     elif any(facts.fingerprint):
-        why = "It is of an open team and this node of a closed one, or this node does not have the newest team secret."
-        remedy = "Join that team, or set known_nodes of this team; a node that was away for long has to join again."
+        why = "Either that node is in an open team, or this node does not have the newest team secret."
+        remedy = (
+            "Join that team, or set known_nodes to nodes of this team; after a long absence a node has to join again."
+        )
     else:
-        why = "It replies to probes of any node, but not to probes with this node's [node] team_key."
-        remedy = "Set the same [node] team_key on both."
-    yield make_error("wrong-team", f"The node at {foreign[0].address} is of another team.", why, remedy)
+        why = "That node replies to a PROBE, but not to a DISCOVERY with this node's [node] team_key."
+        remedy = "Set the same [node] team_key on both nodes."
+    yield make_error("wrong-team", f"The node at {foreign[0].address} belongs to another team.", why, remedy)
 
 
 def check_version(facts: Facts) -> Iterator[Finding]:
@@ -51,7 +55,7 @@ def check_version(facts: Facts) -> Iterator[Finding]:
         yield make_error(
             "version-skew",
             f"The node at {answer.address} has another version of the protocol.",
-            f"It has version {answer.version}, this node {VERSION}.",
+            f"That node has version {answer.version}, this node has version {VERSION}.",
             f"Upgrade {older}: pip install --upgrade swarm-node.",
         )
 
@@ -68,7 +72,7 @@ def check_clock(facts: Facts) -> Iterator[Finding]:
         "clock-off",
         f"This machine's clock is {_format_duration(abs(offset))} {direction} the other nodes' clocks.",
         f"Measured at {len(offsets)} nodes." if len(offsets) > 1 else "Measured at one node, whose clock may be wrong.",
-        "Set it, for example by timedatectl set-ntp true. The validity of certificates depends on the clock.",
+        "Set this clock, for example with timedatectl set-ntp true. The validity of certificates depends on the clock.",
     )
 
 
@@ -76,14 +80,14 @@ def check_certificate(facts: Facts) -> Iterator[Finding]:
     """Check that the node's certificate is valid now, and that other nodes accept it."""
     own, offsets = facts.certificate, _list_clock_offsets(facts)
     offset = median(offsets) if offsets else 0.0
-    # With a wrong clock a valid certificate seems invalid; the clock is then reported as the cause.
+    # With a wrong clock a valid certificate seems invalid: report the clock as the cause.
     now = facts.wall + (offset if abs(offset) > MAX_SKEW_S else 0.0)
     if own is not None and own.problem:
         yield make_error(
             "certificate-unreadable",
             "The node's membership is not usable.",
             own.problem,
-            "Apply the remedy that the reason names.",
+            "Follow the remedy in this reason.",
         )
     elif own is not None and now >= own.not_after:
         why = f"It ended on {_format_time(own.not_after)}; this machine's clock shows {_format_time(facts.wall)}."
@@ -96,7 +100,7 @@ def check_certificate(facts: Facts) -> Iterator[Finding]:
             "certificate-ends",
             f"The node's certificate ends in {_format_duration(own.not_after - now)}.",
             f"It is valid until {_format_time(own.not_after)}.",
-            "Let it run for an hour while it reaches a bootstrap node, or renew it as operator: swarm renew NAME.",
+            "Keep the node connected to a bootstrap node for an hour, or renew as operator: swarm renew NAME.",
         )
 
 
@@ -104,7 +108,10 @@ def report_rejections(facts: Facts) -> Iterator[Finding]:
     """Report the refusals that the running node received."""
     for code, peer in facts.health.refusals if facts.health is not None else ():
         yield make_error(
-            CAUSE_CODES.get(code, code), f"{peer} rejects this node: {code}.", "It sent a refusal.", _make_remedy(code)
+            CAUSE_CODES.get(code, code),
+            f"{peer} rejects this node: {code}.",
+            "That peer sent a refusal.",
+            _make_remedy(code),
         )
 
 

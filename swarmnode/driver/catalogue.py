@@ -105,7 +105,7 @@ def format_serial_devices(found: list[SerialDevice]) -> list[str]:
     if not found:
         return [
             "no serial device is plugged in",
-            "a robot in the network has to be named, for example:",
+            "a robot in the network needs its address, for example:",
             "  swarm driver probe --kind aibo --option host=192.168.0.51",
         ]
     lines = []
@@ -118,7 +118,7 @@ def format_serial_devices(found: list[SerialDevice]) -> list[str]:
 
 
 def list_cable_kinds() -> list[str]:
-    """Return the kinds of robots with a cable; a serial device does not show which kind it is."""
+    """Return the kinds of robots with a cable; a serial device does not show the kind of its robot."""
     return [kind for kind in list_built_in_kinds() if load_manifest(kind).is_on_cable]
 
 

@@ -50,7 +50,7 @@ def make_parser() -> argparse.ArgumentParser:
         each.add_argument("--json", action="store_true", help="print JSON, one line per result")
     probe.add_argument("--seconds", type=_parse_seconds, default=3.0, help="duration in seconds (default: 3)")
     monitor.add_argument(
-        "--seconds", type=_parse_seconds, default=math.inf, help="duration in s (default: until Ctrl-C)"
+        "--seconds", type=_parse_seconds, default=math.inf, help="duration in seconds (default: until Ctrl-C)"
     )
     monitor.add_argument("--picture", type=Path, metavar="FILE", help="save the newest picture to FILE every second")
     return main_parser
@@ -103,7 +103,7 @@ def _list_devices(options: argparse.Namespace, say: WriteLines) -> int:
 
     found = list_serial_devices()
     if options.verb != "probe":
-        sys.stderr.write(f"swarm driver {options.verb}: name the robot by --kind and --option, or by --config\n")
+        sys.stderr.write(f"swarm driver {options.verb}: no robot is selected; pass --kind and --option, or --config\n")
         return WRONG
     say([json.dumps([asdict(each) for each in found])] if options.json else format_serial_devices(found))
     return 0 if found else FAILED

@@ -38,7 +38,7 @@ class Terminal(Protocol):
 
 
 class DriveSession:
-    """One session of ``driver``, from the connection until a key ends it; then the motors are off."""
+    """A session in which keys control ``driver``: it starts with the connection and ends with the motors off."""
 
     def __init__(
         self, driver: Driver, clock: IReactorTime, terminal: Terminal, problems: Callable[[], list[str]]
@@ -56,10 +56,10 @@ class DriveSession:
         self._ended: Deferred[int] = Deferred()
 
     def start(self) -> Deferred[int]:
-        """Begin; fires with the exit code when the robot stands, its motors are off, and the link is closed."""
+        """Begin; fires with the exit code when the robot has stopped, its motors are off, and the link is closed."""
         self._terminal.write_line(HELP)
         self._terminal.write_line(
-            f"a key has effect for {KEY_HOLD_S:g} s: hold it to continue; release it to stop the robot"
+            f"a key has effect for {KEY_HOLD_S:g} s: hold the key to continue; release it to stop the robot"
         )
         self._driver.connect().addCallbacks(self._on_connected, self._on_refused)
         self._terminal.start(self._on_key)

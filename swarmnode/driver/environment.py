@@ -1,6 +1,6 @@
 """Environment of the robot commands: clock, links and terminal of this machine.
 
-Links and the log of drivers report why a robot is not reachable.
+The links, and the log messages of drivers, show why a robot is not reachable.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ class RealEnvironment:
     @property
     def clock(self) -> Any:
         """The reactor."""
-        from twisted.internet import reactor  # the import installs it
+        from twisted.internet import reactor  # importing it installs the reactor
 
         return reactor
 
     def make_connector(self, is_moving: bool) -> tuple[Any, Callable[[], list[str]]]:
-        """Return links that report problems; a moving robot gets its driver's default links, with a supervised stop."""
+        """Return a connector that records problems, or None to drive: the default links supervise the robot's stop."""
         if is_moving:
             return None, list
         from drivers.link import TcpConnector
@@ -92,7 +92,7 @@ class RealEnvironment:
 
 
 class RecordingConnector:
-    """Opens real links over TCP or serial devices, and records the problem of each."""
+    """Opens real links over TCP or serial devices, and records the newest error of each link."""
 
     def __init__(self, tcp: Any, serial: Any) -> None:
         self._tcp = tcp
@@ -103,12 +103,12 @@ class RecordingConnector:
         """Keep ``client`` connected, as the wrapped connector does."""
         is_serial = SERIAL_PATTERN.fullmatch(host) is not None
         reconnector = (self._serial if is_serial else self._tcp).connect(host, port, client)
-        # Keep only the newest link to each place: a robot with an HTTP interface has one for each request.
+        # Keep only the newest link to each address: a robot with an HTTP interface has a link for each request.
         self._reconnectors[host if is_serial else f"{host}:{port}"] = reconnector
         return reconnector
 
     def list_problems(self) -> list[str]:
-        """Return each link that is not open now, with the reason."""
+        """Return the links that are not open now, each with the reason."""
         results = {place: str(getattr(reconnector, "problem", "")) for place, reconnector in self._reconnectors.items()}
         return [f"{place}: {problem}" for place, problem in results.items() if problem]
 

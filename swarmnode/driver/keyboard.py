@@ -1,4 +1,4 @@
-"""Keys to motion with a dead man's switch: a key has effect for 0.4 s; without a key the robot stands.
+"""Motion by keys, with a dead man's switch: a key has effect for 0.4 s; without a key the robot stops.
 
 The time is an argument; the driver is the only side effect.
 """
@@ -27,9 +27,9 @@ END_KEYS = ("x", "\x03", "\x04", "")
 
 
 class KeyboardController:
-    """Drive ``driver`` by keys; ``message`` is the last message for the person at the keyboard.
+    """Controls ``driver`` by keys; ``message`` is the last message for the user.
 
-    Commands carry the highest fencing token that the robot has obeyed: the person at the robot is outside of any team.
+    Commands carry the highest fencing token that the robot has accepted, because the user acts without a lease.
     """
 
     def __init__(self, driver: Driver) -> None:

@@ -24,9 +24,9 @@ DISPLAY_INTERVAL_S = 1.0
 
 
 class Monitor:
-    """Show the readings of ``driver`` through ``show`` until stopped, or for ``seconds`` after the first.
+    """Shows the readings of ``driver`` by ``show`` until it is stopped, or for ``seconds`` after the first reading.
 
-    Nothing is commanded: the motors keep their state.
+    It sends no commands, so the motors keep their state.
     """
 
     def __init__(
@@ -110,7 +110,7 @@ class Monitor:
     def _save(self, frame: Frame) -> None:
         assert self._picture is not None
         if frame.encoding != "jpeg":
-            self._fail(f"its pictures are {frame.encoding}, not JPEG; none was saved")
+            self._fail(f"the pictures are {frame.encoding}, not JPEG; no picture was saved")
             self.end()
             return
         temporary = self._picture.with_name(f".{self._picture.name}.new")

@@ -16,9 +16,9 @@ from drivers.timer import Timer
 from swarmnode.driver.formatting import format_reading, make_json_safe
 
 SILENCE_TIMEOUT_S = 8.0
-"""Seconds after which a silent robot is given up; the slowest error report is the AIBO's, after 5 s."""
+"""Seconds after which the probe of a silent robot ends; the AIBO is the slowest to report an error, after 5 s."""
 PROBLEM_TIMEOUT_S = 3.0
-"""Seconds after which a silent robot with a known problem is given up."""
+"""Seconds after which the probe of a silent robot with a known problem ends."""
 MIN_RATE_SHARE = 0.7
 """Share of the specified rate below which a robot is reported as slow."""
 REPORTED_KEYS = (
@@ -31,14 +31,14 @@ REPORTED_KEYS = (
     "power.volts",
     "power.charging",
 )
-"""Readings that are part of the finding."""
+"""Readings that are part of the result."""
 
 
 @dataclass(frozen=True)
 class ProbeResult:
     """The result of a probe.
 
-    ``first`` is the time in seconds until the first observation, None without one; ``rate`` and ``promised`` are
+    ``first`` is the time in seconds until the first observation, or None; ``rate`` and ``promised`` are
     observations per second; ``problems`` are sentences with the remedy.
     """
 
@@ -86,7 +86,7 @@ class Probe:
         self._result: Deferred[ProbeResult] = Deferred()
 
     def start(self) -> Deferred[ProbeResult]:
-        """Begin; fires with the finding, and never fails."""
+        """Begin; fires with the result, and never fails."""
         self._timer.set(PROBLEM_TIMEOUT_S, self._on_silence)
         self._driver.subscribe(self._on_observation)
         self._driver.connect().addCallbacks(self._on_connected, self._on_refused)
@@ -133,11 +133,15 @@ class Probe:
         frame = None if newest is None else newest.frame
         problems = [*([self._connect_error] if self._connect_error else []), *self._problems()]
         if self._first_s is None and not problems:
-            problems.append(f"no data within {SILENCE_TIMEOUT_S:g} s; check that it is switched on, and the options")
+            problems.append(
+                f"no data within {SILENCE_TIMEOUT_S:g} s; check the options, and that the robot is switched on"
+            )
         if self._first_s is not None and rate < MIN_RATE_SHARE * promised:
-            problems.append(f"it is slow: {rate:.1f} of {promised:g} observations per second; check the radio link")
+            problems.append(
+                f"the robot is slow: {rate:.1f} of {promised:g} observations per second; check the radio link"
+            )
         if "camera" in body.capabilities and self._first_s is not None and not self._pictures:
-            problems.append("no picture received, although it has a camera; check that the camera is on")
+            problems.append("no picture received from the camera; check that the camera is on")
         return ProbeResult(
             kind=body.kind,
             first=self._first_s,
@@ -154,7 +158,7 @@ class Probe:
 
 
 def format_result(finding: ProbeResult) -> Iterator[str]:
-    """Return the finding as lines of text."""
+    """Return the result as lines of text."""
     if finding.first is None:
         yield f"{finding.kind}: not reached"
     else:

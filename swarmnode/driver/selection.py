@@ -43,16 +43,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments that select a robot."""
     parser.add_argument("--kind", help="kind of robot: one of `swarm driver list`, or module:Class")
     parser.add_argument(
-        "--option", action="append", default=[], metavar="KEY=VALUE", help="option of its driver; can be repeated"
+        "--option",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="option of the robot's driver; can be repeated",
     )
-    parser.add_argument("--config", metavar="FILE", help="settings file of its node, instead of --kind")
+    parser.add_argument("--config", metavar="FILE", help="settings file of the robot's node, instead of --kind")
     parser.add_argument("--name", help="name of the robot; in a simulator it selects the robot")
 
 
 def select_robot(arguments: argparse.Namespace) -> RobotSelection | None:
-    """Return the selected robot, None if none is named; raises ``UsageError`` or ``BadSetting``."""
+    """Return the selected robot, or None if no argument selects a robot; raises ``UsageError`` or ``BadSetting``."""
     if arguments.config and arguments.kind:
-        raise UsageError("use either --kind or --config, not both")
+        raise UsageError("--kind and --config are both given; use only one of them")
     if arguments.config:
         return _select_by_settings(arguments.config, arguments)
     if arguments.kind:
@@ -70,18 +74,18 @@ def select_robot_by_word(word: str, arguments: argparse.Namespace) -> RobotSelec
 
 
 def parse_options(words: Sequence[str]) -> dict[str, Any]:
-    """Parse ``KEY=VALUE`` arguments: a value is TOML if possible, otherwise text; ``ports.walk=1`` nests."""
+    """Parse ``KEY=VALUE`` arguments: a value is TOML if possible, otherwise text; ``ports.walk=1`` makes a table."""
     table: dict[str, Any] = {}
     for word in words:
         key, equals, text = word.partition("=")
         names = key.split(".")
         if not equals or not all(names):
-            raise UsageError(f"--option {word}: write KEY=VALUE, for example --option host=192.168.0.51")
+            raise UsageError(f"--option {word} is not KEY=VALUE; write for example --option host=192.168.0.51")
         inner = table
         for name in names[:-1]:
             inner = inner.setdefault(name, {})
             if not isinstance(inner, dict):
-                raise UsageError(f"--option {key} is given as a value and as a table")
+                raise UsageError(f"--option {key} is given both as a value and as a table")
         inner[names[-1]] = _parse_value(text)
     return table
 
@@ -110,7 +114,7 @@ def _select_by_settings(path: str, arguments: argparse.Namespace) -> RobotSelect
 
     settings = Settings.load(path)
     if not settings.driver.kind:
-        raise UsageError(f'{path} has no robot: set kind = "..." in [driver]')
+        raise UsageError(f'{path} has no robot; set kind = "..." in [driver]')
     _add_working_directory(settings.driver.kind)
     options = {**settings.driver.options, **parse_options(arguments.option)}
     parts = settings.driver.parts

@@ -108,7 +108,7 @@ def find_twistd(executable: str, is_user: bool, can_enter: Callable[[Path], bool
 
 
 def _resolve_interpreter(executable: str) -> Path:
-    """Return the real path of the interpreter; in an environment it is often a link."""
+    """Return the real path of the interpreter, which is often a symbolic link in a virtual environment."""
     return Path(executable).resolve()
 
 
@@ -120,7 +120,7 @@ class _Service:
         units = home / "systemd/user" if is_user else Path("/etc/systemd/system")
         self._label = PREFIX + name
         self._unit = root / units.relative_to("/") / f"{self._label}.service"
-        # systemd moves it below `private` at the first start, and makes a link.
+        # At the first start systemd moves this folder below `private`, and replaces it by a link.
         self._state = root / "var/lib" / self._label
         self._is_user = is_user
         self._run_command = run
@@ -139,7 +139,7 @@ class _Service:
             if self._systemctl(*words) != DONE:
                 return self._report_failure()
         if self._is_user:
-            self._out.write("It stops when you sign out, unless you run: loginctl enable-linger\n")
+            self._out.write("The service stops when you sign out, unless you run: loginctl enable-linger\n")
         return DONE
 
     def apply(self, verb: str) -> int:
@@ -156,7 +156,7 @@ class _Service:
         return DONE if ended == DONE else FAILED
 
     def _copy_settings(self, path: str) -> None:
-        """Copy the settings to the service's folder, and the files that they name unless they are there."""
+        """Copy the settings, and the files that they refer to, to the service's folder; keep files that exist there."""
         settings, folder = Settings.load(path), Path(path).parent
         self._state.mkdir(mode=0o700, parents=True, exist_ok=True)
         named = [settings.node.store, settings.node.membership]

@@ -35,12 +35,12 @@ class Unit:
     memory: str = MEMORY_LIMIT
     devices: tuple[str, ...] = ()
     needs_low_port: bool = False
-    """Whether it listens on a port below 1024, which needs a capability."""
+    """Whether the node listens on a port below 1024, which needs a capability."""
     interpreter: str = ""
 
     @property
     def label(self) -> str:
-        """The name of the unit without suffix, also of its folders."""
+        """The name of the unit without its suffix; the unit's folders have the same name."""
         return PREFIX + self.name
 
     @property
@@ -121,7 +121,7 @@ _MOUNT_RESTRICTIONS = (
 def make_unit(
     settings: Settings, twistd: str, is_user: bool, memory: str = MEMORY_LIMIT, interpreter: str = ""
 ) -> Unit:
-    """Return the unit of the node with these settings, whose file is ``settings.origin``."""
+    """Return the unit of the node with these settings; ``settings.origin`` is the path of the settings file."""
     node, web = settings.node, settings.web
     ports = [node.port, node.tunnel_port]
     if "web" in node.roles:

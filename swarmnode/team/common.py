@@ -48,7 +48,7 @@ class CommandContext:
 
 @dataclass(frozen=True)
 class VerifiedTeam:
-    """A node's view of its team; all of it is signed and was verified here."""
+    """A node's view of its team, from signed entries that this command has verified."""
 
     team: str
     membership_list: MembershipList
@@ -65,7 +65,7 @@ class VerifiedTeam:
         return [each for each, refusal in self.membership_list.list_known_members(now) if refusal == EXPIRED]
 
     def find_member(self, name: str, now: float, has_expired: bool = False) -> Member:
-        """Return the member with that name or key, with ``has_expired`` also an expired one; raises ``Rejection``."""
+        """Return the member with this name or key; ``has_expired`` allows expired members.  Raises ``Rejection``."""
         members = self.list_members(now)
         called = [each for each in members if name in (each.name, each.public.hex())]
         if not called and has_expired:
@@ -86,7 +86,7 @@ def make_parser(
     epilog = f"Example: swarm {prog} {example}".rstrip()
     verb_parser = argparse.ArgumentParser(prog=f"swarm {prog}", description=purpose, epilog=epilog)
     if is_asked:
-        verb_parser.add_argument("--node", metavar="NAME", help="node on this machine, if several run")
+        verb_parser.add_argument("--node", metavar="NAME", help="name of the node, if several run on this machine")
     verb_parser.add_argument("--json", action="store_true", help="print JSON, on one line")
     if needs_key:
         verb_parser.add_argument(
@@ -131,7 +131,7 @@ def get_key_folder() -> Path:
 
 
 def load_operator(named: Path | None) -> Operator:
-    """Load the named operator's key, or the only one on this machine; raises ``InvalidCommand`` or ``BadKeyFile``."""
+    """Load the operator's key in ``named``, by default the only one here; raises ``InvalidCommand``, ``BadKeyFile``."""
     path = named or (Path(os.environ[OPERATOR_VARIABLE]) if os.environ.get(OPERATOR_VARIABLE) else None)
     if path is None:
         keys = sorted(get_key_folder().glob(f"*{KEY_FILE_SUFFIX}"))
@@ -168,7 +168,7 @@ def parse_duration(text: str) -> float:
     """Parse ``90s``, ``10m``, ``24h`` or ``7d`` as seconds; raises ``argparse.ArgumentTypeError``."""
     match = re.fullmatch(r"(\d{1,9})([smhd]?)", text)
     if match is None or int(match[1]) == 0:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a duration; write 90s, 10m, 24h or 7d")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a duration; write for example 90s, 10m, 24h or 7d")
     return float(int(match[1]) * UNIT_SECONDS[match[2] or "s"])
 
 

@@ -62,13 +62,19 @@ def main(words: Sequence[str] | None = None, context: CommandContext | None = No
     )
     init.add_argument("team", metavar="NAME", help="name of the team")
     init.add_argument("--first", metavar="NODE", default="bootstrap", help="name of the first node (bootstrap)")
-    init.add_argument("--page", action="store_true", help="the first node serves the page, also to its network")
-    init.add_argument("--folder", metavar="DIR", type=Path, default=Path("."), help="folder of its files (default: .)")
+    init.add_argument("--page", action="store_true", help="the first node serves the page to its whole network")
+    init.add_argument(
+        "--folder", metavar="DIR", type=Path, default=Path("."), help="folder for the files of the nodes (default: .)"
+    )
     init.add_argument(
         "--at", metavar="HOST:PORT", help=f"address of the first node, also for newcomers (default: *:{NODE_PORT})"
     )
     init.add_argument(
-        "--set", metavar="KEY=VALUE", action="append", default=[], help="setting of [node] for all newcomers"
+        "--set",
+        metavar="KEY=VALUE",
+        action="append",
+        default=[],
+        help="setting of [node] for all newcomers; can be repeated",
     )
     init.add_argument(
         "--member",
@@ -91,12 +97,12 @@ def _create(arguments: argparse.Namespace, context: CommandContext) -> Answer:
     for text in arguments.member:
         member = _parse_member(text, arguments.folder)
         if member.name in {each.name for each in members}:
-            raise InvalidCommand(f"--member {text}: another member has this name; choose another one")
+            raise InvalidCommand(f"--member {text}: another member has this name; choose another name")
         members.append(member)
     texts = _format_settings_files(members, arguments.at, arguments.page, team)
     for path in (key, *(each.membership_path for each in members), *texts):
         if path.exists():
-            raise InvalidCommand(f"{path} is there already; choose another team name, or --folder DIR")
+            raise InvalidCommand(f"{path} exists already; choose another team name, or --folder DIR")
     created = _create_memberships(operator, members, context)
     _make_folders(key.parent, arguments.folder)
     operators.create_operator_file(key, operator)
@@ -157,7 +163,7 @@ def _create_memberships(
         try:
             membership = operator.create_membership(each.name, each.roles, context.wall(), context.rng, secret)
         except ValueError as error:
-            raise InvalidCommand(f"a member's name or role: {error}") from error
+            raise InvalidCommand(f"a member's name or role is not valid: {error}") from error
         found[each.membership_path] = membership
         secret = membership.secrets[0][1]
     return found
@@ -177,7 +183,7 @@ def parse_team_settings(given: Sequence[str]) -> dict[str, Any]:
     for each in given:
         key, sign, value = each.partition("=")
         if not sign or key not in SHARED_KEYS:
-            raise InvalidCommand(f"--set {each}: write KEY=VALUE, with one of the keys {', '.join(SHARED_KEYS)}")
+            raise InvalidCommand(f"--set {each} is not KEY=VALUE with one of the keys {', '.join(SHARED_KEYS)}")
         try:
             whole = Settings.from_mapping({"node": {"name": "any"}}, COMMAND_LINE).with_flags(**{key: value})
         except BadSetting as error:
@@ -199,7 +205,7 @@ def format_settings(
     if at is not None:
         host, colon, port = at.rpartition(":")
         if not colon or not port.isdecimal():
-            raise InvalidCommand(f"--at {at}: write HOST:PORT")
+            raise InvalidCommand(f"--at {at} is not HOST:PORT")
         node.update(host=host.strip("[]"), port=int(port))
     tables = {"node": node, **({"web": {"host": "0.0.0.0"}} if "web" in roles else {})}
     try:

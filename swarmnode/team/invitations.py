@@ -14,7 +14,7 @@ OPEN, USED, EXPIRED, REVOKED = "open", "used", "expired", "revoked"
 
 def main(words: Sequence[str] | None = None, context: CommandContext | None = None) -> int:
     """Run the command; returns its exit code."""
-    purpose = "List the invitations that can be used; end one by swarm revoke."
+    purpose = "List the invitations that can still be used; to end an invitation, use swarm revoke."
     invitations = make_parser("invitations", purpose, needs_key=False, example="--all")
     invitations.add_argument("--all", action="store_true", help="also list used, expired and revoked invitations")
     return run_verb(invitations, words, context, _list)
@@ -32,12 +32,12 @@ def _list(arguments: argparse.Namespace, context: CommandContext) -> Answer:
         line = f"{row['name']:{width}}  {', '.join(row['roles'])}  {row['left']} of {row['uses']} left"
         came = f"  joined: {', '.join(row['came'])}" if row["came"] else ""
         lines.append(f"{line}  until {until}  {row['state']}{came}")
-    end = "To end one: swarm revoke NAME --invitation"
+    end = "To end an invitation: swarm revoke NAME --invitation"
     return {"team": found.team, "invitations": rows}, [*lines, end] if lines else ["no open invitations"]
 
 
 def _make_row(found: VerifiedTeam, invite: Invite, now: float) -> dict[str, Any]:
-    """Return one invitation as plain data."""
+    """Return the invitation as plain data."""
     came = [
         each.member.name for each in found.membership_list.list_admissions() if each.member.invitation == invite.public
     ]

@@ -27,7 +27,7 @@ INVITABLE_ROLES = tuple(role for role in ROLES if role != "bootstrap")
 
 def main(words: Sequence[str] | None = None, context: CommandContext | None = None) -> int:
     """Run the command; returns its exit code."""
-    invite = make_parser("invite", "Create a code by which a newcomer joins the team.", example="dog1 --expires 24h")
+    invite = make_parser("invite", "Create a code with which a newcomer joins the team.", example="dog1 --expires 24h")
     invite.add_argument("name", metavar="NAME", help="name of the newcomer")
     invite.add_argument(
         "--role", choices=INVITABLE_ROLES, action="append", help="role; can be repeated (default: device)"
@@ -76,12 +76,12 @@ def _invite(arguments: argparse.Namespace, context: CommandContext) -> Answer:
     lines = [f"{code.text}   admits {arguments.name}, {times}, within {format_duration(arguments.expires)}"]
     lines.append(f"On the newcomer:  swarm join {text}")
     if not addresses:
-        lines.append("No bootstrap node is reachable now; name one by: swarm join CODE --at HOST:PORT")
+        lines.append("No bootstrap node is reachable now; pass the address of one: swarm join CODE --at HOST:PORT")
     return answer, [*lines, *render_qr_code(text)]
 
 
 def render_qr_code(text: str) -> list[str]:
-    """Return a QR code of ``text`` as characters; a hint if the library for it is missing."""
+    """Return a QR code of ``text`` as lines of characters, or a hint if the library segno is missing."""
     try:
         import segno
     except ModuleNotFoundError:

@@ -49,14 +49,22 @@ def main(
     join = make_parser("join", purpose, needs_key=False, is_asked=False, example=example)
     join.add_argument("code", metavar="CODE", help="code shown by swarm invite, with or without @HOST:PORT")
     join.add_argument(
-        "--at", metavar="HOST:PORT", action="append", default=[], help="bootstrap node (default: search the LAN)"
+        "--at",
+        metavar="HOST:PORT",
+        action="append",
+        default=[],
+        help="address of a bootstrap node (default: search the LAN)",
     )
     join.add_argument(
         "--tunnel", metavar="URL", action="append", default=[], help="tunnel if UDP is blocked, as wss://HOST:PORT"
     )
-    join.add_argument("--name", metavar="NAME", default="", help="name of this member, if the code does not fix it")
-    join.add_argument("--folder", metavar="DIR", type=Path, default=Path("."), help="folder of its files (default: .)")
-    join.add_argument("--files", metavar="NAME", default="swarm", help="base name of its files (default: swarm)")
+    join.add_argument(
+        "--name", metavar="NAME", default="", help="name of this member, if the code does not determine it"
+    )
+    join.add_argument(
+        "--folder", metavar="DIR", type=Path, default=Path("."), help="folder for this member's files (default: .)"
+    )
+    join.add_argument("--files", metavar="NAME", default="swarm", help="base name of these files (default: swarm)")
     join.add_argument(
         "--timeout", type=parse_duration, default=JOIN_TIMEOUT_S, metavar="TIME", help="maximum time (default: 20s)"
     )
@@ -84,13 +92,13 @@ def _join(
     ]
     path = arguments.folder / f"{arguments.files}.membership"
     if path.exists():
-        # A code has a single use: do not spend it if the result cannot be stored.
+        # Do not use up the code if the result cannot be stored.
         raise InvalidCommand(
-            f"{path} is there already: this is a member; remove it to join again, or pass --files NAME"
+            f"{path} exists: this machine is a member; remove the file to join again, or pass --files NAME"
         )
     addresses = addresses or list(find_nodes())
     if not addresses:
-        raise InvalidCommand("no bootstrap node was named, and none replies on the LAN; pass --at HOST:PORT")
+        raise InvalidCommand("no bootstrap node was given, and none replies on the LAN; pass --at HOST:PORT")
     try:
         arguments.folder.mkdir(parents=True, exist_ok=True)
         seed_file = arguments.folder / f".{arguments.files}.joining"
@@ -122,7 +130,7 @@ def _join(
         f"  {settings}  its settings; start it by: twistd -n --pidfile= swarm-node --config {settings}",
     ]
     if is_kept:
-        lines.append(f"{settings} was there already and was not changed: check its name and known_nodes")
+        lines.append(f"{settings} existed and was not changed: check name and known_nodes in it")
     ignored = sorted(set(membership.settings) - set(given))
     if ignored:
         lines.append(f"Ignored settings of the invitation, which a team cannot set: {', '.join(map(repr, ignored))}")
@@ -135,7 +143,7 @@ def _join(
 def _load_or_create_seed(path: Path, code: JoinCode, context: CommandContext) -> bytes:
     """Return the newcomer's key, stored at ``path`` before it is sent.
 
-    After an interrupted join the same key is sent again, so the code's use is not lost.
+    After an interrupted join the same key is sent again, so the code is not used up twice.
     """
     invitation = code.key.public.hex()
     if path.exists():
@@ -163,7 +171,7 @@ def resolve_address(text: str) -> list[Address]:
 
 
 def find_lan_nodes() -> list[Address]:
-    """Return the nodes on the LAN that reply, of any team; only the code's team accepts the request."""
+    """Return the nodes of any team that reply on the LAN; only nodes of the code's team accept the join request."""
     from swarmnode.doctor.measure import discover_on_lan
 
     return [each.address for each in discover_on_lan()]

@@ -30,7 +30,7 @@ def _promote(arguments: argparse.Namespace, context: CommandContext) -> Answer:
     operator = load_operator(arguments.operator)
     member = fetch_team(arguments.node, context, operator).find_member(arguments.name, context.wall())
     roles = tuple(dict.fromkeys([*member.roles, arguments.role]))
-    # The grant must be later than the operator's last one; a certificate that is not renewable keeps its end.
+    # A grant must be later than the operator's previous grant; a certificate that is not renewable keeps its end.
     begin = max(int(context.wall()), member.since + 1)
     life = member.life if member.is_renewable else max(1, member.not_after - begin)
     publish_statement(arguments.node, context, operator.grant(member.public, member.name, roles, begin, life))

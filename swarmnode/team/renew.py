@@ -1,4 +1,4 @@
-"""``swarm renew``: issue a new certificate for a member's key, also for an expired one."""
+"""``swarm renew``: issue a new certificate for a member's key, even after the old certificate has expired."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from swarmnode.team.common import (
 
 def main(words: Sequence[str] | None = None, context: CommandContext | None = None) -> int:
     """Run the command; returns its exit code."""
-    purpose = "Renew the certificate of a member, with the same key, name and roles; also an expired one."
+    purpose = "Renew the certificate of a member with the same key, name and roles, even after its expiry."
     renew = make_parser("renew", purpose, example="dog1 --for 365d")
     renew.add_argument("name", metavar="NAME", help="name of the member, or its key in hexadecimal")
     renew.add_argument(
@@ -38,7 +38,7 @@ def main(words: Sequence[str] | None = None, context: CommandContext | None = No
 def _renew(arguments: argparse.Namespace, context: CommandContext) -> Answer:
     operator = load_operator(arguments.operator)
     member = fetch_team(arguments.node, context, operator).find_member(arguments.name, context.wall(), has_expired=True)
-    # The grant must be later than the operator's last one.
+    # A grant must be later than the operator's previous grant.
     begin = max(int(context.wall()), member.since + 1)
     publish_statement(
         arguments.node, context, operator.grant(member.public, member.name, member.roles, begin, arguments.life)

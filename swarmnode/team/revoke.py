@@ -26,7 +26,9 @@ def main(words: Sequence[str] | None = None, context: CommandContext | None = No
     revoke = make_parser("revoke", purpose, example="dog1")
     revoke.add_argument("name", metavar="NAME", help="name of a member or an invitation, or its key in hexadecimal")
     revoke.add_argument("--invitation", action="store_true", help="revoke the invitation of that name, not the member")
-    revoke.add_argument("--all", action="store_true", help="also revoke all that a bootstrap node admitted or renewed")
+    revoke.add_argument(
+        "--all", action="store_true", help="also revoke all members that this bootstrap node admitted or renewed"
+    )
     return run_verb(revoke, words, context, _revoke)
 
 
@@ -40,12 +42,12 @@ def _revoke(arguments: argparse.Namespace, context: CommandContext) -> Answer:
         keys = [each.public for each in kept]
         statement = operator.revoke(public, arguments.name[:40], context.wall(), keys, renewals)
     except ValueError as error:
-        raise Rejection(f"{error}; pass --all, and invite the members again that are to stay") from error
+        raise Rejection(f"{error}; pass --all, and invite again the members that should stay") from error
     publish_statement(arguments.node, context, statement)
     lines = [f"revoked {what} {arguments.name}; effective at all reachable nodes within 10 seconds"]
     lines += [f"  also revoked: {name}" for name in came]
     lines += [f"  stays a member, although admitted by {arguments.name}: {each.name}" for each in kept]
-    lines.append("It still knows the team's secret; replace that by: swarm rotate")
+    lines.append("It still knows the team's secret; to replace the secret: swarm rotate")
     kept_names = [each.name for each in kept]
     return {"revoked": public.hex(), "what": what, "with": came, "kept": kept_names}, lines
 
@@ -56,7 +58,7 @@ def _list_admitted(found: VerifiedTeam, public: bytes, now: float) -> list[Membe
 
 
 def _list_renewed(found: VerifiedTeam, public: bytes, now: float) -> list[tuple[bytes, int]]:
-    """Return the key and end of each renewal of current members that the bootstrap node ``public`` signed."""
+    """Return the key and expiry of each renewal of current members that the bootstrap node ``public`` signed."""
     return [(each.public, each.not_after) for each in found.list_members(now) if each.renewer == public != each.public]
 
 
@@ -70,7 +72,7 @@ def _resolve(found: VerifiedTeam, name: str, is_invitation: bool, now: float) ->
         return found.find_member(name, now, has_expired=True).public, "the member", []
     except Rejection:
         if not invites and re.fullmatch(r"[0-9a-f]{64}", name):
-            return bytes.fromhex(name), "the key", []  # also a key that is on no list
+            return bytes.fromhex(name), "the key", []  # a key can be revoked even if no list contains it
         if not invites:
             raise
     if len(invites) > 1:

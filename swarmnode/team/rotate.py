@@ -20,7 +20,7 @@ from swarmnode.team.common import (
 )
 
 GRACE_S = 7 * 86_400.0
-"""Seconds for which the previous secret is accepted, so offline members can return.  Less is safer."""
+"""Seconds for which the previous secret is accepted, so offline members can return.  A shorter time is safer."""
 
 
 def main(words: Sequence[str] | None = None, context: CommandContext | None = None) -> int:

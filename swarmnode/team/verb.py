@@ -24,7 +24,7 @@ OPEN_TEAM_ERROR = (
 
 
 class TeamVerbs:
-    """The control socket requests of one node: its team's, and ``others`` for the rest."""
+    """Runs the control socket requests of one node: those about its team here, all others by ``others``."""
 
     def __init__(self, others: RequestRunner, node: SwarmNode) -> None:
         self._others = others
@@ -43,7 +43,7 @@ class TeamVerbs:
 
     def _run_for_team(self, work: Callable[[Team, Arguments], object], arguments: object) -> object:
         if not isinstance(arguments, dict):
-            raise BadRequest("the arguments of a request have to be an object with names")
+            raise BadRequest("the arguments of a request must be a JSON object")
         if self._node.team is None:
             raise Refused(OPEN_TEAM_ERROR)
         return work(self._node.team, Arguments(arguments))
@@ -65,6 +65,6 @@ class TeamVerbs:
             ),
             "entries": [base64.b64encode(packed).decode() for packed in team.membership_list.list_packed()],
             "here": {public.hex(): address for public, address in here.items()},
-            # A newcomer cannot reach bootstrap nodes that are reached by relay or tunnel.
+            # A newcomer cannot use the virtual address of a relay or tunnel.
             "doors": [here[each] for each in bootstraps if each in here and not here[each].startswith("~")],
         }

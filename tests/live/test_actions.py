@@ -66,7 +66,7 @@ class ActionPageTests(PageCase):
             self.view(page, "tasks")
             page.locator(".preview li").first.wait_for()
             self.assertEqual(page.locator(".preview [data-can=with]").count(), 0)
-            self.assertIn("divided among", page.locator("label[for=group]").inner_text())
+            self.assertIn("assigned jointly", page.locator("label[for=group]").inner_text())
             if type_on:
                 self.tab_to(page, "#group")
                 page.keyboard.type("yard")

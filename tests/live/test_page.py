@@ -116,7 +116,7 @@ class PageTests(PageCase):
         self.view(page, "network")
         page.locator("#network-line", has_text="dog3 did not answer").wait_for()
         rows = [row.split("\t") for row in page.locator("#round-trips tr").all_inner_texts()]
-        self.assertEqual(rows[1:], [["dog1", "", "3.6", "5.4"], ["dog2", "1.8", "", "not known"]])
+        self.assertEqual(rows[1:], [["dog1", "", "3.6", "5.4"], ["dog2", "1.8", "", "unknown"]])
         self.assertEqual(page.locator(".tie").count(), 2)
         self.assertIn("5 asked in 2 hops, 8 found", page.locator("#lookups").inner_text())
         self.view(page, "devices")

@@ -54,8 +54,8 @@ class PathsTests(PageCase):
                 ],
                 [
                     "a newcomer at 192.0.2.66:8484 is rejected by vaio; 3 min ago",
-                    "used: this code was used as often as it may be",
-                    "Remedy: ask the operator for another one (swarm invite)",
+                    "used: this code has no uses left",
+                    "Remedy: ask the operator for a new code (swarm invite)",
                 ],
             ],
         )

@@ -94,7 +94,7 @@ class AdmissionTests(SynchronousTestCase):
         self.assertEqual(dict(kept.membership.settings), {"presence_lease": 2.5})
         self.assertEqual(Path(found["operator"]).stat().st_mode & 0o777, 0o600)
         self.assertEqual(self.run_verb(init.main, *words)[0], 2)
-        self.assertIn("is there already", self.said)
+        self.assertIn("exists already", self.said)
 
     def test_init_with_options(self) -> None:
         """By default the first node listens on all interfaces.
@@ -178,11 +178,11 @@ class AdmissionTests(SynchronousTestCase):
         (where / "swarm.toml").write_text('[node]\nname = "mine"\n')
         text = self.done(invite.main, "dog9")["text"]
         _, output = self.run_verb(join.main, text, "--folder", str(where), send_requests=self.knock)
-        self.assertIn("was there already", output)
+        self.assertIn("existed and was not changed", output)
         self.assertEqual((where / "swarm.toml").read_text(), '[node]\nname = "mine"\n')
         text = self.done(invite.main, "dog8")["text"]
         _, output = self.run_verb(join.main, text, "--folder", str(self.folder / "other"), send_requests=self.knock)
-        self.assertNotIn("was there already", output)
+        self.assertNotIn("existed and was not changed", output)
 
     def test_key_of_another_code_is_not_used(self) -> None:
         """A repeated join with the same code uses the same key; a join with a different code creates a new key."""

@@ -54,7 +54,7 @@ class ChaosTests(SynchronousTestCase):
         self.team(faults=False)
         code, output = self.chaos("dog1 loss")
         self.assertEqual((code, output), (1, ""))
-        self.assertIn('dog1: it does not allow faults; set "allow = true" in [faults]', self.shell.said)
+        self.assertIn('dog1: fault injection is off; set "allow = true" in [faults]', self.shell.said)
 
     def test_wrong_words(self) -> None:
         """An unknown kind, an invalid amount and an unknown device each give one error line with a remedy."""

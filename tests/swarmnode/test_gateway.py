@@ -239,7 +239,7 @@ class GatewayTests(SynchronousTestCase):
         self.phones.clear()
         self.live(0.5)
         refusal = self.failureResultOf(phone.at.join(b"s" * 32, "anna", CAN), Refusal).value
-        self.assertEqual((refusal.status, refusal.problem), (409, "an operator removed it"))
+        self.assertEqual((refusal.status, refusal.problem), (409, "an operator removed this phone"))
         self.live(3.0)
         self.successResultOf(phone.at.join(b"s" * 32, "anna", CAN))
 

@@ -70,7 +70,7 @@ class WhyTests(SynchronousTestCase):
         code, output = self.shell.run(main, ["last"])
         self.assertEqual((code, output.splitlines()[-1]), (1, "no decision yet"))
         self.assertEqual(self.shell.run(main, ["zz"])[0], 1)
-        self.assertEqual(self.shell.said, f"swarm why: no task begins with 'zz'; the newest are {task}\n")
+        self.assertEqual(self.shell.said, f"swarm why: no task id begins with 'zz'; the newest are {task}\n")
         self.assertEqual(self.shell.run(main, ["last", "--node", "nobody"])[0], 2)
         self.assertIn("no node 'nobody' runs", self.shell.said)
 
@@ -88,9 +88,9 @@ class WhyTests(SynchronousTestCase):
             Deferred.fromCoroutine(node.submit(Task(task_id, "search", "red")))
         self.team.clock.advance(1.0)
         self.assertEqual(self.shell.run(main, ["zz"])[0], 1)
-        self.assertEqual(self.shell.said, "swarm why: no task begins with 'zz'; the newest are a , a [2J\n")
+        self.assertEqual(self.shell.said, "swarm why: no task id begins with 'zz'; the newest are a , a [2J\n")
         self.shell.run(main, ["a"])
-        self.assertEqual(self.shell.said, "swarm why: 2 tasks begin with 'a': a , a [2J; give more of the id\n")
+        self.assertEqual(self.shell.said, "swarm why: 2 task ids begin with 'a': a , a [2J; enter more characters\n")
 
     def test_prefix(self) -> None:
         """An ambiguous prefix is rejected with the matching ids.
@@ -102,5 +102,5 @@ class WhyTests(SynchronousTestCase):
         self.assertEqual(select_task("ab", tasks).task_id, "ab")
         self.assertEqual(select_task("abc", tasks).task_id, "abc")
         error = self.assertRaises(Rejection, select_task, "a", tasks)
-        self.assertEqual(str(error), "2 tasks begin with 'a': abc, ab; give more of the id")
+        self.assertEqual(str(error), "2 task ids begin with 'a': abc, ab; enter more characters")
         self.assertRaises(Rejection, select_task, "", tasks)

@@ -132,7 +132,7 @@ class MemoryPhones:
         """Record the picture."""
         self._check(jpeg)
         if uuid not in self.registered:
-            raise Refusal("uuid", "this phone takes no part here", "join by POST /api/v1/phones", 404)
+            raise Refusal("uuid", "this phone has not joined here", "join with POST /api/v1/phones", 404)
         self.pictures.append((uuid, jpeg, values))
         return PictureReply(10.0, "Look for the red target: turn slowly.")
 

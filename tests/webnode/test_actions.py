@@ -118,7 +118,7 @@ class ActionTests(SynchronousTestCase):
         """The response to a message lists its recipients; for a device that has left, it is an error."""
         self.assertEqual(self.ask("POST", "message", {"text": "sit"}), (202, {"delivered": [], "failed": {}}))
         self.assertEqual(self.ask("POST", "devices/01/message", {"text": "sit"})[1]["id"], "01")
-        left = Refusal("device", "dog1 left during the request", "wait until it is back", 409)
+        left = Refusal("device", "dog1 left during the request", "wait until the device is back", 409)
 
         def lost(*wish: object) -> Deferred[Any]:
             return fail(left)

@@ -93,14 +93,14 @@ class LeafTests(SynchronousTestCase):
         """A certificate is valid until a month before its end; later, and before its start, it has a flaw."""
         self.assertEqual(self.flaw(), "")
         self.assertEqual(self.flaw(NOW + (VALIDITY - RENEWAL_MARGIN).total_seconds() - 3 * DAY), "")
-        self.assertEqual(self.flaw(NOW + (VALIDITY - RENEWAL_MARGIN).total_seconds()), "it expires soon")
-        self.assertEqual(self.flaw(NOW - 3 * DAY), "it is not valid yet")
+        self.assertEqual(self.flaw(NOW + (VALIDITY - RENEWAL_MARGIN).total_seconds()), "the certificate expires soon")
+        self.assertEqual(self.flaw(NOW - 3 * DAY), "the certificate is not valid yet")
         lasts = self.leaf.certificate.not_valid_after_utc - self.leaf.certificate.not_valid_before_utc
         self.assertEqual(lasts, timedelta(days=365))
 
     def test_name_what_it_lacks(self) -> None:
-        """A missing address is a flaw; a missing name that the authority cannot sign is not."""
-        self.assertEqual(self.flaw(names=["192.168.0.8"]), "it lacks 192.168.0.8")
+        """A missing address is a flaw; a name that the authority cannot sign is not."""
+        self.assertEqual(self.flaw(names=["192.168.0.8"]), "the certificate lacks 192.168.0.8")
         self.assertEqual(self.flaw(names=["8.8.8.8", "example.org", "fe80::1%eth0", "", "a b.local", "-"]), "")
         self.assertEqual(self.flaw(names=["::ffff:192.168.0.7", "VAIO.local.", "127.0.0.1", "localhost"]), "")
 

@@ -58,7 +58,7 @@ class FaultControlTests(SynchronousTestCase):
         self.assertIsNone(self.cause(self.uuid("dog1"), "kill"))
         self.team.clock.advance(5.0)
         self.assertEqual(list(self.control.get_kinds(self.uuid("dog1"))), list(KINDS))
-        self.assertEqual(self.cause(self.uuid("dog1"), "loss").problem, "it has left the network")
+        self.assertEqual(self.cause(self.uuid("dog1"), "loss").problem, "the device has left the network")
         self.team.clock.advance(20.0)
         self.assertIsNone(self.cause(self.uuid("dog1"), "loss"))
 

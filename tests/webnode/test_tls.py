@@ -70,7 +70,7 @@ class CertificateProviderTests(SynchronousTestCase):
     def test_make_it_once(self) -> None:
         """The first start writes a private certificate file, which the next start uses."""
         _, said = self.provider()
-        self.assertIn("there is none yet", said)
+        self.assertIn("no certificate exists yet", said)
         pem = self.path.read_bytes()
         self.assertEqual(stat.S_IMODE(self.path.stat().st_mode), 0o600)
         self.assertEqual(set(parse_leaf(pem).names), {"localhost", "127.0.0.1", "::1", "192.168.0.7"})
@@ -97,11 +97,11 @@ class CertificateProviderTests(SynchronousTestCase):
 
         faults: list[tuple[Any, str]] = [
             (lambda: self.path.chmod(0o644), "other users can read"),
-            (cut, "no certificate with its key"),
-            (lambda: self.path.write_bytes(b""), "no certificate with its key"),
-            (moved, "it lacks 192.168.0.8"),
+            (cut, "does not contain a certificate"),
+            (lambda: self.path.write_bytes(b""), "does not contain a certificate"),
+            (moved, "the certificate lacks 192.168.0.8"),
             (sworn, "another authority"),
-            (aged, "it expires soon"),
+            (aged, "the certificate expires soon"),
         ]
         for seed, (fault, words) in enumerate(faults):
             self.provider(seed)
@@ -202,7 +202,7 @@ class TlsPortTests(SynchronousTestCase):
         entrance._reactor = Taken()
         words = str(self.assertRaises(PortTaken, entrance.open, site_of(Data(b"hi", "text/plain"), Clock())))
         self.assertIn("127.0.0.1:8443", words)
-        self.assertIn("choose another tls_port", words)
+        self.assertIn("set tls_port to another port", words)
 
 
 class Line(StringTransport):

@@ -38,7 +38,7 @@ def inject_fault(request: RouteRequest) -> Any:
     uuid, services, kind = find_device(request)["uuid"], request.services, request.values["kind"]
     if services.faults is None:
         raise Refusal(
-            "device", "this node does not inject faults", 'set "allow = true" below [faults] in its settings', 409
+            "device", "fault injection is off on this node", 'set "allow = true" below [faults] in its settings', 409
         )
     seconds, amount = request.values["seconds"], request.values["amount"]
 

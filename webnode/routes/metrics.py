@@ -1,7 +1,7 @@
 """Routes of the metrics: the state of the team in the Prometheus text format, by the library prometheus_client.
 
-Values are read at each request.  The library is imported at the first request; its global registry is not used, as it
-would add permanent metrics of this process.
+Values are read at each request.  The library is imported at the first request; its global registry is not used, because
+it would add permanent metrics of this process.
 """
 
 from __future__ import annotations
@@ -81,7 +81,9 @@ def _make_families(state: State, services: Services, now: float) -> Iterator[Any
     for kind in get_args(CountedKind):
         connections.add_metric([kind], services.limits.get_total(kind))
     yield connections
-    orders = CounterMetricFamily("swarm_page_orders", "Orders given through this node.", labels=("role", "status"))
+    orders = CounterMetricFamily(
+        "swarm_page_orders", "Requests for changes through this node.", labels=("role", "status")
+    )
     for (role, status), count in sorted(services.audit.get_counts().items()):
         orders.add_metric([role, status], count)
     yield orders

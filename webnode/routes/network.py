@@ -31,7 +31,7 @@ def read_inventory(request: RouteRequest) -> Any:
 
 def _require_diagnostics(request: RouteRequest) -> Diagnostics:
     if request.services.diagnostics is None:
-        raise Refusal("node", "it cannot query devices", "use another web node of the team", 409)
+        raise Refusal("node", "this node cannot query devices", "use another web node of the team", 409)
     return request.services.diagnostics
 
 

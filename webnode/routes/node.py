@@ -84,7 +84,7 @@ ROUTES = (
     Route(
         "GET",
         "/shot/{uuid}",
-        "The newest picture of a camera, as soon as there is a new one; 204 after five seconds without",
+        "The newest picture of a camera, as soon as its number differs; 204 after five seconds without a new picture",
         "viewer",
         None,
         (

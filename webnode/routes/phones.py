@@ -52,15 +52,17 @@ VALUE_RANGES: Mapping[str, ValueRange] = {
     "position.accuracy": ValueRange(0.0, 1e6, "m"),
 }
 PAIRED_VALUES = (("target.bearing", "target.distance"), ("position.lat", "position.lon"))
-"""Pairs of values of which both or none have to be present."""
+"""Pairs of values; a picture must have both values of a pair, or neither."""
 
 
 def register_phone(request: RouteRequest) -> Deferred[Json]:
     """Register a phone as a device."""
     if request.services.phones is None:
-        raise Refusal("phone", "this node does not accept phones", "use another web node", 409)
+        raise Refusal("phone", "this node does not accept phones", "use another web node of the team", 409)
     if request.user.name.startswith(PHONE_PREFIX):
-        raise Refusal("ticket", "it is valid for one phone's pictures only", "sign in and use that token", 403)
+        raise Refusal(
+            "ticket", "the ticket is valid for the pictures of one phone only", "sign in and use that token", 403
+        )
     values = request.values
     secret, name = values["secret"], values["name"]
     if not re.fullmatch(rf"[0-9a-fA-F]{{{2 * SECRET_BYTES}}}", secret):
@@ -85,7 +87,7 @@ def parse_values(text: str) -> dict[str, float]:
     except (ValueError, RecursionError):
         found = None
     if not isinstance(found, dict):
-        raise Refusal("values", "not a JSON object", 'send for example {"target.bearing": 0.1}')
+        raise Refusal("values", "the values are not a JSON object", 'send for example {"target.bearing": 0.1}')
     for name, value in found.items():
         value_range = VALUE_RANGES.get(name)
         if value_range is None:
@@ -117,9 +119,9 @@ class PhoneResource(JsonResource):
         user = get_user(request)
         try:
             if self._services.phones is None:
-                raise Refusal("phone", "this node does not accept phones", "use another web node", 409)
+                raise Refusal("phone", "this node does not accept phones", "use another web node of the team", 409)
             if user.role == "phone" and user.name != f"{PHONE_PREFIX}{uuid}":
-                raise Refusal("ticket", "it belongs to another phone", f"join by POST {API}/phones", 403)
+                raise Refusal("ticket", "the ticket belongs to another phone", f"join with POST {API}/phones", 403)
             reply = self._handle(self._services, self._services.phones, uuid, request)
         except Refusal as refusal:
             return write_refusal(request, refusal)
@@ -142,7 +144,7 @@ def receive_picture(services: Services, phones: Phones, uuid: str, request: Requ
 
 
 def remove_phone(services: Services, phones: Phones, uuid: str, request: Request) -> Json:
-    """Remove the phone; sent by a page that is closed or hidden."""
+    """Remove the phone; a page sends this request when it is closed or hidden."""
     phones.leave(uuid)
     source = str(getattr(request.getClientAddress(), "host", ""))
     services.audit.write(get_user(request), source, f"POST {API}/phones/{{uuid}}/leave", uuid[:64], "200")

@@ -25,7 +25,7 @@ def sign_in(request: RouteRequest) -> Deferred[Json]:
     """Sign in with a code or a password."""
     code, password = request.values["code"], request.values["password"]
     if bool(code) == bool(password):
-        problem = "both code and password are given" if code else "it is missing or empty"
+        problem = "both code and password are given" if code else "the code or password is missing or empty"
         raise Refusal("code", problem, 'send {"code": "..."} or {"password": "..."}')
     return request.services.sessions.sign_in(code or password, request.source, request.now).addCallback(_describe_token)
 
@@ -105,7 +105,7 @@ def _describe_url(url: str) -> dict[str, Json]:
 
 
 def _describe_authority(invites: Invites, urls: list[str]) -> dict[str, Json]:
-    """Return the URL of the authority, without TLS, as a browser that lacks it would show a warning."""
+    """Return the authority's URL without TLS; over TLS a browser that lacks the authority would show a warning."""
     if not invites.authority:
         return {"certificate": "", "fingerprint": ""}
     plain = next((url for url in urls if url.startswith("http:")), urls[0])

@@ -17,10 +17,10 @@ from webnode.team_control import TeamControl
 Row = dict[str, Json]
 """A setting in JSON."""
 SETTING_FIELDS = (
-    Field("description", "text", "a line about the device", minimum=0, maximum=200, default=None),
-    Field("presence_lease", "number", "time until the others drop it if it is silent", default=None, unit="s"),
+    Field("description", "text", "a one-line description of the device", minimum=0, maximum=200, default=None),
+    Field("presence_lease", "number", "time after which other nodes remove a silent device", default=None, unit="s"),
     Field("capabilities", "table", "capabilities in addition to those of its driver", default=None),
-    Field("camera_fps", "number", "pictures of its camera", default=None, unit="per second"),
+    Field("camera_fps", "number", "frame rate of its camera", default=None, unit="per second"),
 )
 
 
@@ -90,7 +90,7 @@ ROUTES = (
     Route(
         "PUT",
         PATH,
-        "Change some of them; the device validates all before it changes any",
+        "Change some settings of a device, which validates all values before it changes any",
         "operator",
         _handle_change,
         (DEVICE, *SETTING_FIELDS),

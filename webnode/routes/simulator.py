@@ -45,7 +45,9 @@ def clear_target(request: RouteRequest) -> Any:
 def _require_map(request: RouteRequest, what: str) -> Mapping[str, Any]:
     robot_map = request.services.control.get_map()
     if robot_map is None:
-        raise Refusal(what, "this node has no robot simulator", "start one, or name it in the settings", 409)
+        raise Refusal(
+            what, "this node has no robot simulator", "start a simulator, and set its address in [web] yard", 409
+        )
     return robot_map
 
 

@@ -24,7 +24,7 @@ def stop_team(request: RouteRequest) -> Any:
 
 
 def release_team(request: RouteRequest) -> Any:
-    """End the given stops, or all known ones."""
+    """End the given stops, by default all known stops."""
     return (
         _require_stop_control(request)
         .release(_get_name(request), request.values.get("stops"))
@@ -33,7 +33,7 @@ def release_team(request: RouteRequest) -> Any:
 
 
 def _summarize(devices: dict[str, str], otherwise: bool) -> Any:
-    """Summarize the confirmations; ``otherwise``: whether a team without robots counts as stopped."""
+    """Summarize the confirmations; ``otherwise``: whether a team without robots is reported as stopped."""
     robots = [each for each in devices.values() if each != NO_ROBOT]
     return {"halted": all(each == STANDS_STILL for each in robots) if robots else otherwise, "devices": devices}
 
@@ -52,7 +52,7 @@ RESPONSE = "halted (every robot stands still), devices (state by uuid, as text)"
 STOPS = Field(
     "stops",
     "list",
-    "The ids of the stops to end, as in `halt` of the state; all known ones if it is left out",
+    "The ids of the stops to end, as in `halt` of the state; all known stops if omitted",
     maximum=MAX_RELEASED,
     default=None,
 )

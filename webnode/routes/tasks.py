@@ -42,8 +42,8 @@ def assign_task(request: RouteRequest) -> Any:
 def _derive_task_id(request: RouteRequest, what: str) -> str:
     """Derive the id of the new task from the idempotency key; empty without a key.
 
-    It is the same at every web node: a page whose node failed before answering repeats the request at another one,
-    which recognizes it by the id of the task.
+    The id is the same at every web node.  A page whose node failed before its answer repeats the request at another
+    node, which recognizes the repetition by the id of the task.
     """
     if not request.id:
         return ""
@@ -78,7 +78,7 @@ def _make_order_route(
 
 
 NAME = Field("name", "text", "name in the catalogue", maximum=64)
-GROUP = Field("group", "text", "tasks of one group are divided among the devices together", maximum=64, default="")
+GROUP = Field("group", "text", "tasks of one group are assigned jointly, one to each device", maximum=64, default="")
 ROUTES = (
     Route("GET", f"{API}/tasks", "The tasks, the newest first", "viewer", list_tasks, response="a list of tasks"),
     Route(
@@ -109,7 +109,7 @@ ROUTES = (
             Field(
                 "tolerates",
                 "whole",
-                "members of its council that may fail at once",
+                "members of its council that may fail at the same time",
                 minimum=1,
                 maximum=3,
                 default=1,
@@ -127,7 +127,7 @@ ROUTES = (
         preview_task,
         (NAME, GROUP),
         response="able (uuid, name, busy: its current task), refused (reasons by name), likely (a name, or null), "
-        "together (id, title: tasks that the group divides with it)",
+        "together (id, title: tasks of the group that are assigned jointly with it)",
     ),
     _make_order_route(
         "cancel", "End a task; its lease is no longer granted", lambda request: request.services.control.cancel

@@ -6,7 +6,7 @@ import { formatNumber, text } from "./texts.js";
 
 const cameras = new Map();
 const figures = new WeakMap();
-// One observer for all figures: which of them are in view.
+// One observer reports which of all figures are in view.
 const observer = new IntersectionObserver((entries) => {
   for (const { target, isIntersecting } of entries) figures.get(target)?.setVisible(isIntersecting);
 });
@@ -40,7 +40,7 @@ class Camera {
     return this.visible && !this.gone && !this.closed && !document.hidden;
   }
 
-  // Start the loop if the camera is in view, else abort the pending request.
+  // Start the loop if the camera is in view; otherwise abort the pending request.
   updateLoop() {
     if (!this.isWanted) this.request?.abort();
     else if (!this.request) this.loop();
@@ -71,7 +71,7 @@ class Camera {
     this.request = null;
   }
 
-  // Request from the node that serves now; a pending answer of the last node is of no use.
+  // Request from the node that serves now; a pending answer of the previous node is no longer needed.
   restart() {
     this.seq = "";
     this.isRestarted = this.request !== null;

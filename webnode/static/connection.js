@@ -1,5 +1,5 @@
-// The connection: the only module that sends requests to the team.  When the serving node is lost it connects to another
-// one, and repeats pending requests there.
+// The connection: the only module that sends requests to the team.  When the serving node is lost, it connects to
+// another node, and repeats pending requests there.
 import { raceNodes, storePages } from "./failover.js";
 import { getTicket, getToken, storeSession } from "./session.js";
 import { createStream } from "./stream.js";
@@ -58,8 +58,8 @@ export async function fetchOnce(address, options) {
   }
 }
 
-// A node carries out a request once per id, so requests can be repeated; the id of a new task is derived from it, so a
-// task that is requested again at another node is the same one.
+// A node carries out a request once per id, so requests can be repeated.  The id of a new task is derived from the id
+// of its request, so a repetition at another node does not create a second task.
 async function call(method, path, body) {
   const order = method !== "GET";
   const requestHeaders = order ? { "Content-Type": "application/json", "X-Swarm": "1", "Idempotency-Key": `${VIEWER}-${++requests}` } : {};
@@ -91,7 +91,8 @@ async function call(method, path, body) {
   throw Object.assign(new Error(message), { status: answer.status, field });
 }
 
-// Both return the node's answer, or throw an Error with a message for people (with status and field, if refused).
+// Both return the node's answer, or throw an Error with a message for the user (with status and field if the node
+// rejected the request).
 export const get = async (path) => (await call("GET", path)).reply;
 export const send = async (method, path, body = {}) => (await call(method, path, body)).reply;
 
@@ -101,13 +102,13 @@ export async function openSession(method, proof = {}) {
   storeSession(at, reply);
 }
 
-// Fetch tokens for the team's other nodes in advance, as a lost node cannot issue them.
+// Fetch tokens for the team's other nodes in advance, because a lost node cannot issue them.
 async function fetchPasses(listed) {
   const passes = await call("GET", "session/passes").catch(() => null);
   if (passes) storePages(listed, passes.reply, passes.at);
 }
 
-// End the session: the last request of a page.  Pending requests are aborted, as they would fail without a session.
+// End the session: the last request of a page.  Pending requests are aborted, because they would fail without a session.
 export async function endSession() {
   pending.forEach((request) => request.abort());
   const last = send("DELETE", "session").catch(() => {});
@@ -115,7 +116,7 @@ export async function endSession() {
   await Promise.race([last, pause(PATIENCE)]);
 }
 
-// The next picture of a camera, as a Response: 200, 204 if there is no newer one, or a refusal.
+// The next picture of a camera, as a Response: 200, 204 if there is no newer picture, or a refusal.
 export const fetchFrame = (uuid, after, signal) => fetch(`${here}/shot/${uuid}?after=${after}&viewer=${VIEWER}&ticket=${getTicket(here)}`, { signal });
 
 // Receive all events, as onEvent(name, data); "link" reports the connection: live, lost.  A hidden page receives nothing,
@@ -148,7 +149,7 @@ export function openStream({ onEvent }) {
     },
   });
 
-  // A page that is open for days stays signed in; the stream is reopened, as its URL contains the old ticket.
+  // A page that is open for days stays signed in; the stream is reopened, because its URL contains the old ticket.
   const renewSession = () => getToken(here) && openSession("PUT").then(updateStream, () => {});
 
   function updateStream() {
@@ -157,7 +158,7 @@ export function openStream({ onEvent }) {
   }
 
   document.addEventListener("visibilitychange", updateStream);
-  // A hidden page receives no event that tells it to renew its session.
+  // A hidden page receives no event, so it renews its session by itself.
   setInterval(() => { if (document.hidden) renewSession(); }, RENEWED);
   setInterval(() => fetchPasses(pages), PASSES);
   updateStream();

@@ -1,4 +1,4 @@
-// Device: the dialog with the details of one device, and the orders to it.
+// Device: the dialog with the details of one device, and the requests to it.
 import { byId, createElement, describeStatus, updateList, formatPresence, setText } from "./element.js";
 import { describeDelivery, sendRequest } from "./request.js";
 import { back } from "./shell.js";

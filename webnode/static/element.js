@@ -1,4 +1,4 @@
-// Elements: create them, and update lists of them without rebuilding the ones that a person is using.
+// Elements: create them, and update lists of elements without rebuilding an element that the user is using.
 import { text, textOf } from "./texts.js";
 
 const SVG = "http://www.w3.org/2000/svg";

@@ -1,4 +1,4 @@
-// Failover: the URLs of the team's other web nodes, and which of the nodes answers now.
+// Failover: the URLs of the team's other web nodes, and the search for a node that answers.
 import { hasSession, replaceSessions } from "./session.js";
 
 const VERSION = 1;
@@ -30,15 +30,15 @@ export function storePages(listed, passes, here) {
   }
 }
 
-// A node without a token is not asked.  A page over TLS does not switch to one without, and loopback URLs are used only
-// by a page of this machine.
+// Nodes for which the page has no token are skipped.  A page over TLS does not switch to a URL without TLS, and only a
+// page of this machine uses loopback URLs.
 function isReachable({ url }) {
   if (!hasSession(url)) return false;
   if (isSecure(location.origin) && !isSecure(url)) return false;
   return !isLoopback(url) || isLoopback(location.origin);
 }
 
-// A frozen node still accepts connections, so only a complete answer counts.
+// A frozen node still accepts connections, so only a complete answer shows that a node works.
 async function checkNode(url, node) {
   const answer = await fetch(`${url}/api/v1/node`, { cache: "no-store", signal: AbortSignal.timeout(PATIENCE) });
   const reply = await answer.json();
@@ -46,7 +46,8 @@ async function checkNode(url, node) {
   return url;
 }
 
-// Return the first node that answers; `first` is asked first, each other one a little later or when the one before fails.
+// Return the first node that answers.  `first` is asked first; each further node is asked a little later, or when the
+// previous node fails.
 export async function raceNodes(first) {
   const known = new Map([[first, ""], [location.origin, ""]]);
   for (const page of pages.filter(isReachable)) if (!known.has(page.url)) known.set(page.url, page.node);

@@ -5,7 +5,7 @@ import { registerPanel } from "./panel.js";
 const needs = { role: "operator" };
 let known;
 
-// The node lists the kinds of faults; the list is empty if it does not inject faults.
+// The node lists the kinds of faults; the list is empty if fault injection is off on the node.
 const loadFaults = async (name) => {
   known ??= get("faults").catch(() => ({ kinds: [] }));
   const { kinds } = await known;

@@ -29,7 +29,7 @@ async function refresh() {
   timer = setTimeout(refresh, isBusy() ? BUSY : IDLE);
 }
 
-// Between two answers the times run locally.
+// Between two answers the page advances the times itself.
 setInterval(() => {
   if (isBusy() && !document.hidden) for (const draw of views) draw();
 }, TICK);

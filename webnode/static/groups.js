@@ -28,7 +28,7 @@ function updateGroup(article, group) {
     setText(name, member.name);
     bar.firstChild.style.width = `${100 * (member.share ?? 0)}%`;
     setText(cost, member.cost === null ? text(member.available ? "consensus.no_bid" : "consensus.not_free") : text("length.metres", { value: formatNumber(member.cost, 2) }));
-    // The state of a standby contains its place: WAITING(2).
+    // The state of a standby contains its position in the queue: WAITING(2).
     const [, state, rank] = /^(.*?)(?:\((\d+)\))?$/.exec(member.state);
     const said = textOf("agent.state", state, state.toLowerCase());
     const detail = [rank ? text("agent.state_as", { state: said, number: rank }) : said, member.post === null ? "" : text("agent.goes_to", { degrees: member.post }),

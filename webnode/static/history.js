@@ -6,7 +6,7 @@ import { formatTime, text } from "./texts.js";
 
 const SHOWN = 100;
 
-// List chronicle entries; an empty list gets a placeholder.
+// List events; an empty list gets a placeholder.
 export function listEntries(list, entries) {
   const newest = entries.slice(-SHOWN).reverse();
   const none = { n: 0, at: 0, kind: "none", text: text("history.none") };
@@ -18,7 +18,7 @@ export function listEntries(list, entries) {
     });
 }
 
-// The start of the record: a node knows nothing earlier.
+// The start of the event log: a node has no earlier events.
 export const describeStart = (entries) => (entries.length ? text("events.since", { time: formatTime(entries[0].at) }) : "");
 
 // The history of one device or task: the entries that the node keeps, and later ones.

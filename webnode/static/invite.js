@@ -23,7 +23,7 @@ function loadStyle() {
   return styleLoaded;
 }
 
-// Show the SVG drawn by the node; hidden if the node lacks the library for it.
+// Show the SVG that the node drew; hide the element if the node lacks the library for QR codes.
 function showQrCode(figure, svg, label) {
   figure.hidden = !svg;
   if (!svg) return;

@@ -72,7 +72,7 @@ function clampPosition(x, y) {
   return { x: within(x, world.walls[0]), y: within(y, world.walls[1]) };
 }
 
-// One request in flight; of the waiting ones only the newest is kept, so the last one is carried out last.
+// One request in flight; of the waiting requests only the newest is kept, so the last position is set last.
 async function send(doing) {
   next = doing;
   if (sending) return;
@@ -85,7 +85,7 @@ async function send(doing) {
   sending = false;
 }
 
-// Show the new position at once; earlier snapshots must not reset it while the request is in flight.
+// Show the new position immediately; earlier snapshots must not reset it while the request is in flight.
 function moveTarget(spot) {
   settleAt = performance.now() + 700;
   world = { ...world, target: spot && { ...world.target, ...spot } };

@@ -23,7 +23,7 @@ const clamp = (value, least, most) => Math.min(most, Math.max(least, value));
 // Open the camera.  `canvas` shows the picture that the team gets; `onLost` is called when the camera stops.  Throws the
 // browser's error.
 export async function openCamera(canvas, sendsPosition, onLost) {
-  // Both requests belong to the same tap: iOS ignores a later one.
+  // Both requests must belong to the same tap: iOS ignores a later request.
   const turns = requestOrientation();
   const wanted = { facingMode: "environment", width: { ideal: 640 }, height: { ideal: 480 }, frameRate: { ideal: 15 } };
   const stream = await navigator.mediaDevices.getUserMedia({ video: wanted, audio: false });

@@ -26,7 +26,7 @@ function storePhone(phone) {
   try {
     localStorage.setItem(STORAGE_KEY, JSON.stringify(phone));
   } catch {
-    // Without storage it is another device after a reload.
+    // Without storage the phone is a different device after a reload.
   }
 }
 
@@ -126,13 +126,13 @@ export function make(root, { model, go }) {
     const { secret } = phone;
     const at = currentOrigin();
     const reply = await send("POST", "phones", { secret, name: phone.name, width: canvas.width, height: canvas.height, ...camera.has });
-    // A ticket is valid at the node that issued it; after a switch during the request that node is unknown.
+    // A ticket is valid at the node that issued it; after a switch during the request, that node is unknown.
     if (at !== currentOrigin()) return;
     if (run === mine) ticket = { ...reply, at };
     else sendLeave({ ...reply, at });
   }
 
-  // One picture in flight; if the node is lost, the phone joins at the next one.
+  // One picture in flight; if the node is lost, the phone joins at the next node.
   async function sendPictures(mine) {
     let fps = 10;
     let failing = false;
@@ -159,7 +159,7 @@ export function make(root, { model, go }) {
       } catch (error) {
         if (run !== mine) return;
         failing = true;
-        // Errors of the node are for people; errors of the network are not.
+        // Show messages of the node to the user, but not messages of the browser.
         setText(trouble, text("error.trying_again", { problem: error.status ? error.message : text("error.no_answer_now") }));
         await pause(error.status ? RETRY_REFUSED_MS : RETRY_MS);
       }
@@ -168,7 +168,7 @@ export function make(root, { model, go }) {
     }
   }
 
-  // Tell the node also when the page closes, so that another device takes over at once.
+  // Notify the node when the page closes, so that another device takes over immediately.
   function leave(next, line = "") {
     run += 1;
     if (ticket) sendLeave(ticket);

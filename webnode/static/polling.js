@@ -1,6 +1,6 @@
 // Polling: repeat a query only while its panel is in view.
 
-// Call `work` every `every` milliseconds while `root` is in view; the returned function ends that.
+// Call `work` every `every` milliseconds while `root` is in view; the returned function stops the calls.
 export function pollWhileVisible(root, every, work) {
   let isVisible = false;
   let timer = null;

@@ -14,7 +14,7 @@ const METRES = 111_320;
 const isMetres = ({ position }) => "x" in position;
 
 // Coordinates in metres for devices that share a frame: the local frame, or east and north of the first device on the
-// globe.  The frame that more devices use is drawn.  A degree of longitude shrinks towards the poles.
+// globe.  The map shows the frame that more devices use.  A degree of longitude shrinks towards the poles.
 function projectPositions(placed) {
   const local = placed.filter(isMetres);
   if (2 * local.length >= placed.length) return local.map((device) => ({ device, ...device.position }));
@@ -74,7 +74,7 @@ registerPanel({
       if (!placed.length || !root.clientWidth || now === known || due) return;
       known = now;
       draw();
-      // A large map is redrawn at most once a second, as a person may be typing.
+      // A large map is redrawn at most once a second, so it does not delay the user's typing.
       if (placed.length > NAMED) due = setTimeout(() => { due = 0; refresh(); }, PAUSE);
     }
 

@@ -31,7 +31,7 @@ export function make(root, { model }) {
     list.replaceChildren(...rows.map(([kind, line]) => createElement("li", { "data-can": kind }, ...(HEADS[kind] ? [createElement("b", {}, HEADS[kind]), " "] : []), line)));
   }
 
-  // Changes of devices come in bursts: request once after each burst.
+  // Devices change in bursts: send one request after each burst.
   function schedule() {
     clearTimeout(due);
     due = setTimeout(async () => {

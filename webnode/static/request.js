@@ -7,7 +7,7 @@ export function showStatus(message) {
   setText(byId("status-line"), message);
 }
 
-// Describe who received a message, and why others did not.
+// Describe which devices received a message, and why others did not.
 export function describeDelivery({ delivered = [], failed = {} }) {
   const no = groupByReason(failed).map(([names, why]) => ` ${text("message.failed_to", { names: joinNames(names), reason: why })}`).join("");
   if (delivered.length) return text("message.sent_to", { names: joinNames(delivered) }) + no;

@@ -10,7 +10,7 @@ try {
 }
 
 export const getToken = (origin) => sessionsByOrigin[origin]?.token ?? "";
-// Stands for the session in a URL; read only.
+// A credential of the session for URLs; it only permits reading.
 export const getTicket = (origin) => sessionsByOrigin[origin]?.ticket ?? "";
 export const hasSession = (origin) => origin in sessionsByOrigin;
 

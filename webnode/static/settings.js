@@ -1,4 +1,4 @@
-// Settings of a device: a field for each one that the device reports, and a button that sends the changes.
+// Settings of a device: a field for each setting that the device reports, and a button that sends the changes.
 import { createElement, setText } from "./element.js";
 import { sendRequest } from "./request.js";
 import { get } from "./connection.js";

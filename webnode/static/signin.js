@@ -10,7 +10,7 @@ let isChecking = false;
 let onSignedIn = () => {};
 
 // The code of a link is used once and removed from the address, so that no bookmark or screenshot contains it.  The part
-// behind it is the view to show.
+// after the code is the view to show.
 function takeCodeOfLink() {
   const [, code, view] = /^#code=([^/]+)(?:\/(.+))?$/.exec(location.hash) ?? [];
   if (code) history.replaceState(null, "", location.pathname + location.search);

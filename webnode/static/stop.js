@@ -12,7 +12,8 @@ const listFirst = (said) => said.slice(0, MOST).map((line) => ` ${line}.`).join(
 const CODES = { [STANDS]: "stands", [GOES_ON]: "goes_on" };
 const describeRobot = (name, said) => `${name} ${textOf("stop.robot", CODES[said] ?? said, said)}`;
 
-// The result of an order: the number of robots that stand, and each device in another state than requested, by name.
+// The result of a stop or release: the number of robots that stand, and by name each device that is not in the
+// requested state.
 function describeOutcome(devices, told, wanted) {
   const robots = Object.entries(told).filter(([, said]) => said !== "has no robot");
   const odd = robots.filter(([, said]) => said !== wanted).map(([uuid, said]) => describeRobot(devices.get(uuid)?.name ?? uuid.slice(0, 8), said));
@@ -45,7 +46,7 @@ export function make(root, { model }) {
   root.append(stop, banner);
   const done = (wanted) => ({ devices }) => describeOutcome(model.devices, devices, wanted);
   stop.addEventListener("click", () => sendRequest(text("stop.stopping_action"), "halt", { done: done(STANDS) }));
-  // A release ends the stops that are shown, not those ordered meanwhile.
+  // A release ends the stops that the page shows, not stops that were requested since.
   go.addEventListener("click", () => {
     const body = model.halt ? { stops: model.halt.stops.map(({ id }) => id) } : undefined;
     sendRequest(text("stop.releasing_action"), "halt", { method: "DELETE", body, done: done(GOES_ON) });

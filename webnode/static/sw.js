@@ -1,4 +1,4 @@
-// The service worker: caches the page's files, so that the page opens while its node is gone and connects to another.
+// The service worker: caches the page's files, so that the page opens without its node and connects to another node.
 // Data of the team is never cached: no API, no stream, no picture.
 const SHELL = "swarm.shell";
 const PATIENCE = 1000;
@@ -13,8 +13,8 @@ addEventListener("fetch", (event) => {
   event.respondWith(answer(event.request, url));
 });
 
-// Return the node's file if it arrives in time, so that an update shows at once; else the cached one.  A file that is
-// not cached yet is not added here, as the page caches all files at once, and a partial page does not start.
+// Return the node's file if it arrives in time, so that an update shows immediately; otherwise the cached file.  A file that
+// is not cached yet is not added here: the page caches all files together, because an incomplete page does not start.
 async function answer(request, url) {
   const shell = await caches.open(SHELL);
   const kept = await shell.match(url.pathname);

@@ -1,4 +1,4 @@
-// Tasks: assign a predefined one, show the state of each, and cancel, pause or resume it.
+// Tasks: assign a predefined task, show the state of each task, and cancel, pause or resume a task.
 import { groupByReason, byId, setAttribute, createBadge, createElement, updateList, joinNames, setBadge, setText } from "./element.js";
 import { showStatus, sendRequest } from "./request.js";
 import { send, get } from "./connection.js";
@@ -50,7 +50,7 @@ function createHistory(task) {
   return box;
 }
 
-// The decisions on a task: the newest in one line; opened, each with its rule and the reports.
+// The decisions on a task: the newest in one line; when opened, all decisions with their rules and reports.
 function showDecisions(box, epochs) {
   box.hidden = !epochs.length;
   const told = JSON.stringify(epochs);

@@ -12,7 +12,7 @@ const calendar = new Intl.DateTimeFormat(locale, { dateStyle: "medium" });
 const moment = new Intl.DateTimeFormat(locale, { weekday: "long", hour: "2-digit", minute: "2-digit" });
 const numbers = new Map();
 
-// With `digits` fractional digits; without, with as many as the number has, at most three.
+// Format with `digits` fractional digits, by default with all digits of the number, at most three.
 export function formatNumber(value, digits) {
   if (!numbers.has(digits)) {
     const options = { minimumFractionDigits: digits, maximumFractionDigits: digits, useGrouping: "min2" };
@@ -33,7 +33,7 @@ export function text(key, values = {}) {
   return form.replace(/\{(\w+)\}/g, (_, name) => (typeof values[name] === "number" ? formatNumber(values[name]) : values[name]));
 }
 
-// The text of a code that a node sent, or what the node says if the catalogue does not have the code.
+// The text of a code that a node sent, or `otherwise` if the catalogue lacks the code.
 export function textOf(family, code, otherwise = code) {
   const key = `${family}.${code}`;
   return Object.hasOwn(catalogue, key) ? text(key) : otherwise;

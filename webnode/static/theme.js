@@ -1,4 +1,4 @@
-// The theme: light or dark if the visitor chose one, else the system's choice.
+// The theme: light or dark if the visitor chose so, otherwise the system's theme.
 export const STORAGE_KEY = "swarm.theme";
 
 export function readTheme() {

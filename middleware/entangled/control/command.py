@@ -19,8 +19,10 @@ from middleware.entangled.control.socket_path import NoControl, check_owner, che
 
 EXIT_FAILED, EXIT_USAGE = 1, 2
 FIELDS_HELP = """fields:     7  1.5  true  null  "7"  words       valid JSON, otherwise text
-templates:  _  any;  ?int ?float ?str ?bytes ?bool  a type;  >5  <=5  !=red  in:a,b  prefix:job-  a predicate"""
-KEYS_HELP = "A key is any text, or id: followed by 40 hexadecimal digits."
+templates:  _  any;  ?int ?float ?str ?bytes ?bool  a type;  >5  <=5  !=red  in:a,b  prefix:job-  a predicate
+example:    swarm tuple get job ?int --wait 10"""
+KEYS_HELP = "A key is any text, or id: followed by 40 hexadecimal digits.  Example: swarm dht put greeting hello"
+KEYWORD_HELP = "Example: swarm keyword search red ball"
 
 SendRequest = Callable[[Path, dict[str, Any]], Iterator[dict[str, Any]]]
 
@@ -31,7 +33,11 @@ def make_parser(group: str) -> argparse.ArgumentParser:
     common.add_argument("--node", metavar="NAME", help="name of the node, if several run on this machine")
     common.add_argument("--json", action="store_true", help="print JSON, one line per answer")
     if group == "rpc":
-        rpc = argparse.ArgumentParser(prog="swarm rpc", parents=[common], description="Call a method of a node.")
+        rpc = argparse.ArgumentParser(
+            prog="swarm rpc",
+            parents=[common],
+            description="Call a method of a node.  Example: swarm rpc 192.168.1.10:8484 ping",
+        )
         rpc.add_argument("node_asked", metavar="NODE", help="HOST:PORT, or the first digits of a known node's id")
         rpc.add_argument("method", help="name of the method, such as ping")
         rpc.add_argument("arguments", nargs="*", default=[], help="valid JSON, otherwise text")
@@ -41,13 +47,14 @@ def make_parser(group: str) -> argparse.ArgumentParser:
     build = {"dht": _add_dht_commands, "tuple": _add_tuple_commands, "keyword": _add_keyword_commands}[group]
     top = argparse.ArgumentParser(
         prog=f"swarm {group}",
-        epilog=FIELDS_HELP if group == "tuple" else KEYS_HELP if group == "dht" else None,
+        epilog={"tuple": FIELDS_HELP, "dht": KEYS_HELP, "keyword": KEYWORD_HELP}[group],
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     verbs = top.add_subparsers(dest="verb", required=True, metavar="VERB")
 
-    def verb(name: str, purpose: str) -> argparse.ArgumentParser:
-        subparser = verbs.add_parser(name, help=purpose, description=purpose, parents=[common])
+    def verb(name: str, purpose: str, example: str) -> argparse.ArgumentParser:
+        epilog = f"Example: swarm {group} {name} {example}"
+        subparser = verbs.add_parser(name, help=purpose, description=purpose, epilog=epilog, parents=[common])
         subparser.set_defaults(verb=f"{group} {name}")
         return subparser
 
@@ -55,11 +62,13 @@ def make_parser(group: str) -> argparse.ArgumentParser:
     return top
 
 
-def _add_dht_commands(verb: Callable[[str, str], argparse.ArgumentParser]) -> None:
-    get = verb("get", "Print the records under a key.")
+def _add_dht_commands(verb: Callable[[str, str, str], argparse.ArgumentParser]) -> None:
+    get = verb("get", "Print the records under a key.", "greeting")
     get.add_argument("key")
-    get.add_argument("--concern", choices=("fast", "majority"), default="majority", help="one replica, or a majority")
-    put = verb("put", "Store a value under a key, in this node's own slot.")
+    get.add_argument(
+        "--concern", choices=("fast", "majority"), default="majority", help="number of replicas that must reply"
+    )
+    put = verb("put", "Store a value under a key, in this node's own slot.", "greeting hello")
     put.add_argument("key")
     put.add_argument("value", help="text, - for standard input, or @FILE")
     put.add_argument("--name", default="", help="name of this node's slot under the key")
@@ -67,34 +76,44 @@ def _add_dht_commands(verb: Callable[[str, str], argparse.ArgumentParser]) -> No
         "--lifetime",
         choices=("team", "leased"),
         default="team",
-        help="keep the value when this node leaves (team), or remove it (leased)",
+        help="team: keep the value when this node leaves; leased: remove it",
     )
-    put.add_argument("--concern", choices=("one", "majority", "all"), default="majority", help="required replicas")
     put.add_argument(
-        "--expect", type=int, metavar="SEQUENCE", help="store only if the slot has this sequence number; 0: never used"
+        "--concern",
+        choices=("one", "majority", "all"),
+        default="majority",
+        help="number of replicas that must store the value",
     )
-    remove = verb("remove", "Remove this node's value under a key.")
+    put.add_argument(
+        "--expect",
+        type=int,
+        metavar="SEQUENCE",
+        help="store only if the slot has this sequence number; 0: only if it is empty",
+    )
+    remove = verb("remove", "Remove this node's value under a key.", "greeting")
     remove.add_argument("key")
     remove.add_argument("--name", default="")
-    verb("find", "Print the nodes closest to a key.").add_argument("key")
-    verb("watch", "Print the records under a key on each change, until Ctrl-C.").add_argument("key")
+    verb("find", "Print the nodes closest to a key.", "greeting").add_argument("key")
+    verb("watch", "Print the records under a key on each change, until Ctrl-C.", "greeting").add_argument("key")
 
 
-def _add_keyword_commands(verb: Callable[[str, str], argparse.ArgumentParser]) -> None:
-    publish = verb("publish", "Publish data under every word of a name.")
+def _add_keyword_commands(verb: Callable[[str, str, str], argparse.ArgumentParser]) -> None:
+    publish = verb("publish", "Publish data under every word of a name.", "'red ball' @ball.json")
     publish.add_argument("name")
     publish.add_argument("value", help="text, - for standard input, or @FILE")
-    verb("search", "Print the publications whose names contain all of the words.").add_argument("words", nargs="+")
-    verb("watch", "Print the publications with a word on each change, until Ctrl-C.").add_argument("words")
-    verb("remove", "Remove this node's publication under a name.").add_argument("name")
+    verb("search", "Print the publications whose names contain all of the words.", "red ball").add_argument(
+        "words", nargs="+"
+    )
+    verb("watch", "Print the publications with a word on each change, until Ctrl-C.", "ball").add_argument("words")
+    verb("remove", "Remove this node's publication under a name.", "'red ball'").add_argument("name")
 
 
-def _add_tuple_commands(verb: Callable[[str, str], argparse.ArgumentParser]) -> None:
-    put = verb("put", "Put a tuple into the space.")
+def _add_tuple_commands(verb: Callable[[str, str, str], argparse.ArgumentParser]) -> None:
+    put = verb("put", "Put a tuple into the space.", "job 7 --ttl 60")
     put.add_argument("fields", nargs="+", metavar="FIELD")
-    put.add_argument("--ttl", type=float, metavar="SECONDS", help="remove the tuple after that time")
-    get = verb("get", "Take a matching tuple out of the space.")
-    read = verb("read", "Print a matching tuple without taking it.")
+    put.add_argument("--ttl", type=float, metavar="SECONDS", help="remove the tuple after this time")
+    get = verb("get", "Take a matching tuple out of the space.", "job ?int --wait 10")
+    read = verb("read", "Print a matching tuple without taking it.", "job ?int --all")
     for each in (get, read):
         each.add_argument("template", nargs="+", metavar="FIELD")
         each.add_argument("--wait", type=float, metavar="SECONDS", help="wait for a matching tuple for that time")

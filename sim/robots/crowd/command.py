@@ -1,4 +1,4 @@
-"""Simulate a crowd of robots with a batch controller, or a search by hundreds of agents."""
+"""Simulate a crowd of robots with one controller, or a search by agents (``swarm crowd``)."""
 
 from __future__ import annotations
 
@@ -21,8 +21,7 @@ from sim.robots.scene import SceneError
 from sim.robots.world import TICK_S, NotPossible
 
 MakeTeam = Callable[[int, int, CrowdScene, Controller, Callable[[], float]], SearchTeam]
-"""Creates a team from the seed, the number of agents, the scene, the controller of the other robots, and a
-stopwatch."""
+"""Creates a team from seed, number of agents, scene, the controller of the other robots, and a stopwatch."""
 TARGET_DISTANCE_M = 0.6
 """Distance in metres from the centre of the target within which a robot has reached the target."""
 
@@ -31,23 +30,32 @@ def main(arguments: Sequence[str], make_team: MakeTeam | None = None) -> int:
     """Run the simulation; return 0 if the target was reached, 1 if not, 2 for invalid arguments."""
     parser = argparse.ArgumentParser(
         prog="python -m sim.robots.crowd" if make_team is None else "swarm crowd",
-        description=(__doc__ or "").splitlines()[0],
+        description="Simulate a crowd of robots with one controller, or a search by hundreds of agents.",
+        epilog="Example: swarm crowd --bodies 200 --seconds 30 --seed 7",
     )
     parser.add_argument("--bodies", type=int, default=1000, help="number of robots (default %(default)s)")
     parser.add_argument("--room", type=float, default=AREA_M2, help="square metres per robot (default %(default)g)")
-    parser.add_argument("--agents", type=int, default=0, help="number of robots with their own node and agent")
-    parser.add_argument("--controller", choices=sorted(CONTROLLERS), help="for the others (default: wander, or search)")
+    parser.add_argument(
+        "--agents", type=int, default=0, help="number of robots that have a node and an agent (default: 0)"
+    )
+    parser.add_argument(
+        "--controller",
+        choices=sorted(CONTROLLERS),
+        help="controller of the other robots (default: wander; with agents: search)",
+    )
     parser.add_argument("--seed", type=int, default=1, help="seed of the random generators (default %(default)s)")
-    parser.add_argument("--seconds", type=float, default=60.0, help="longest virtual time (default %(default)g)")
+    parser.add_argument(
+        "--seconds", type=float, default=60.0, help="maximum virtual time in seconds (default %(default)g)"
+    )
     parser.add_argument("--picture", type=Path, help="write a map of the robots to this file, as SVG")
-    parser.add_argument("--json", type=Path, help="write the results to this file")
+    parser.add_argument("--json", type=Path, help="write the results to this file, as JSON")
     args = parser.parse_args(list(arguments))
     if not 0 <= args.seed < 2**63:
         parser.error(f"--seed must be a whole number from 0 to {2**63 - 1}, not {args.seed}")
     if not 0 < args.seconds <= 86400:
         parser.error(f"--seconds must be more than 0 and at most 86400, not {args.seconds:g}")
     if args.agents and make_team is None:
-        parser.error("--agents is not available in this command; use swarm crowd")
+        parser.error("--agents is not available here; run swarm crowd instead")
     for path in (args.picture, args.json):
         if path is not None and not path.parent.is_dir():
             parser.error(f"{path} cannot be written: the folder {path.parent} does not exist; create it")
@@ -62,7 +70,7 @@ def main(arguments: Sequence[str], make_team: MakeTeam | None = None) -> int:
 
 def _run_search(args: argparse.Namespace, scene: CrowdScene, make_team: MakeTeam) -> int:
     if not 1 <= args.agents <= scene.robots:
-        raise SceneError(f"--agents must be from 0 to {scene.robots}, the number of robots, not {args.agents}")
+        raise SceneError(f"--agents must be from 0 to the number of robots, {scene.robots}, not {args.agents}")
     started_at = time.process_time()
     controller = CONTROLLERS[args.controller or "wander"]
     team = make_team(args.seed, args.agents, scene, controller, time.process_time)

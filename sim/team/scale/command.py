@@ -122,8 +122,12 @@ def _parse_sizes(text: str) -> list[int]:
 
 def _parse_arguments(arguments: Sequence[str]) -> argparse.Namespace:
     default = SurveySettings()
-    parser = argparse.ArgumentParser(prog="sim scale", description=__doc__)
-    parser.add_argument("--nodes", default=SIZES, help="the sizes, separated by commas (default %(default)s)")
+    parser = argparse.ArgumentParser(
+        prog="sim scale",
+        description="Measure cost and latencies of teams of several sizes, and draw them with theoretical values.",
+        epilog="Example: sim scale --nodes 10,100,1000 --out run/scale",
+    )
+    parser.add_argument("--nodes", default=SIZES, help="sizes of the teams, separated by commas (default %(default)s)")
     parser.add_argument(
         "--out", default="docs/scale", help="folder of scale.json, scale.svg and table.md (default %(default)s)"
     )

@@ -153,7 +153,7 @@ class CommandTests(SynchronousTestCase):
             (("--seconds", "nan"), "--seconds must be"),
             (("--seed", "-1"), "--seed must be"),
             (("--controller", "dance"), "invalid choice"),
-            (("--agents", "3"), "use swarm crowd"),
+            (("--agents", "3"), "run swarm crowd instead"),
             (("--picture", "/nowhere/at/all.svg"), "does not exist"),
             (("--bodies", "121", "--room", "0.0677", "--seconds", "1"), "no place is free"),
         ):
@@ -163,7 +163,7 @@ class CommandTests(SynchronousTestCase):
         for agents in ("10", "-1"):
             code, told = self.run_with("--bodies", "9", "--agents", agents, team=PlayedTeam)
             self.assertEqual(code, 2, told)
-            self.assertIn("--agents must be from 0 to 9", told)
+            self.assertIn("--agents must be from 0 to the number of robots, 9", told)
 
 
 class PictureTests(SynchronousTestCase):

@@ -133,7 +133,7 @@ class DiagnosisTests(SynchronousTestCase):
         self.check(
             ({"known": (STRANGER,), "fingerprint": b"a" * 8, "lan": None}, "error wrong-team", "swarm join"),
             ({"known": (NO_MARK,), "lan": None}, "error wrong-team", "same [node] team_key"),
-            ({"known": (NO_MARK,), "fingerprint": b"a" * 8, "lan": None}, "error wrong-team", "of an open team"),
+            ({"known": (NO_MARK,), "fingerprint": b"a" * 8, "lan": None}, "error wrong-team", "in an open team"),
             ({"known": (newer,), "lan": None}, "error version-skew", "Upgrade this one"),
             ({"certificate": Certificate(0.0, WALL - 1)}, "error certificate-expired", ""),
             ({"certificate": Certificate(WALL + DAY, WALL + 9 * DAY)}, "error certificate-early", ""),

@@ -109,7 +109,7 @@ class DriverCommandTests(SynchronousTestCase):
         """A probe reports that world states are lost."""
         self.dog.faults.drop = 0.5
         _, output, _ = self.ground.swarm_driver(f"probe {BLIND}")
-        self.assertIn("! it is slow", output)
+        self.assertIn("! the robot is slow", output)
 
     def test_probe_is_interrupted_in_order(self) -> None:
         """Ctrl-C ends a probe with the results so far."""
@@ -166,8 +166,8 @@ class DriverCommandTests(SynchronousTestCase):
         for words, told in (
             (["drive", *BLIND.split()], "is not a terminal"),
             (["drive", "--kind", "camera"], "a robot of kind camera does not move"),
-            (["drive"], "name the robot by --kind"),
-            (["probe", "--kind", "aibo", "--config", "x.toml"], "not both"),
+            (["drive"], "no robot is selected"),
+            (["probe", "--kind", "aibo", "--config", "x.toml"], "only one of them"),
             (["probe", "--kind", "warp"], "known are aibo"),
             (["probe", "--kind", "aibo"], "option host is missing"),
             (["probe", "--kind", "aibo", "--option", "host"], "KEY=VALUE"),

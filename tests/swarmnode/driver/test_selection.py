@@ -58,8 +58,8 @@ class SerialDeviceTests(SynchronousTestCase):
         self.assertEqual(told.count("no permission"), 1)
 
     def test_nothing_is_said_as_well(self) -> None:
-        """If there is no serial device, the output says that a robot in the network has to be specified."""
-        self.assertIn("has to be named", "\n".join(format_serial_devices([])))
+        """Without serial devices the output says that a robot in the network needs its address."""
+        self.assertIn("needs its address", "\n".join(format_serial_devices([])))
 
 
 class UnitTests(SynchronousTestCase):
