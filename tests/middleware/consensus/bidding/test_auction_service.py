@@ -191,7 +191,7 @@ class HostileTests(AuctionCase):
             forged = Announcement(99, rank, lie).sign(liar.entangled.identity.sign, auction)
             answer = self.ask(fleet, liar, victim, "bid.announce", auction.pack(), forged.pack())
             self.assertIsInstance(answer, Refused)
-            self.assertIn("no quorum member of the task made it", str(answer))
+            self.assertIn("not signed by a quorum member of the task", str(answer))
         fleet.run(2.0)
         for place in range(5):
             self.assertEqual(self.views[place][-1][0].agent, fleet.nodes[1].uuid)
