@@ -119,7 +119,7 @@ class AuctionServiceTests(AuctionCase):
             around = replace(node.auction_service._environment, contacts=lambda: [known])
             node.auction_service._environment = around
         self.assert_agreed(fleet)
-        self.assertEqual(sum("send their bids here" in text for text in refused), len(outside) - 1 - 2)
+        self.assertEqual(sum("send their bids to this node" in text for text in refused), len(outside) - 1 - 2)
 
     def test_withdrawn_and_bid_anew(self) -> None:
         """A withdrawn bid does not count, a new one does, and an equal bid sends nothing."""
