@@ -9,7 +9,7 @@ A node sends its certificate in the handshake of a session.  A certificate is on
   the bootstrap node, and ``grant`` is the operator's grant to that node with the role ``bootstrap``.  So neither a
   bootstrap node alone nor the holder of a leaked code alone can admit a member.  * ``[2, name, not before, not after,
   signature, gateway, pass]``: a guest, such as a visitor's phone.  A member with the role ``gateway`` signs it, for at
-  most a day; it becomes invalid when the gateway's own certificate (``pass``) does.  * ``[3, content, not before, not
+  most a day; it becomes invalid when the gateway's own certificate ``pass`` does.  * ``[3, content, not before, not
   after, signature, grant]``: a renewal of format 0 or 1.  ``content`` has the fields that the operator signed,
   ``[grant]`` or ``[invite, wish, proof, name, admitter]``; the bootstrap node adds its ``signature`` and its ``grant``.
   Name and roles follow from ``content``, so a renewal changes only the dates.  Only certificates that the operator

@@ -249,8 +249,10 @@ class Deployment:
     # -- processes --------------------------------------------------------------------------------------------------
 
     def _start(self, candidates: list[_Candidate], is_new: bool) -> None:
-        """Start a process for the first candidate that loads; the running version is used until the process is
-        ready."""
+        """Start a process for the first candidate that loads.
+
+        The running version is used until the process is ready.
+        """
         if not candidates:
             return
         manifest, record = candidates[0].manifest, candidates[0].record
@@ -305,8 +307,7 @@ class Deployment:
         self._publish_message(f"runs {manifest.kind} {manifest.name} {manifest.label}")
 
     def _watch(self) -> None:
-        """Stop modules that may no longer run, supervise processes, and check again the authors that were not
-        operators."""
+        """Stop modules that may no longer run, supervise processes, and check rejected authors again."""
         self._later(WATCH_INTERVAL_S, self._watch)
         now = self._seconds()
         for runner, record in (*self._running.values(), *self._starting.values()):

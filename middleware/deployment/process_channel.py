@@ -38,8 +38,10 @@ SANDBOX = "swarmnode.sandbox"
 
 
 class ProcessChannel:
-    """A process that runs ``python -m program`` without the open files, environment and working folder of this
-    process."""
+    """A process that runs ``python -m program``.
+
+    It does not inherit the open files, environment and working folder of this process.
+    """
 
     def __init__(self, program: str = SANDBOX) -> None:
         self._folder = tempfile.mkdtemp(prefix="swarm-module-")
