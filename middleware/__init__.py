@@ -1,4 +1,4 @@
-"""The node: peers, records, devices, tasks, and consensus on who does them.  It knows no robot.
+"""The node: peers, records, devices, tasks, and consensus on the agent of each task.  It has no code for robots.
 
-``entangled`` is the peer-to-peer library, and ``node`` wires the packages that stand on it.
+``entangled`` is the peer-to-peer library, and ``node`` connects the packages that use it.
 """

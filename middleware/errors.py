@@ -5,22 +5,22 @@
     SwarmError
       BadSetting         correct the settings file or the command line
       MissingExtra       install the named extra
-      UnknownTask        name a kind of task or a behaviour that exists
-      UnknownStrategy    name a consensus strategy that exists
-      UnknownAgent       name an agent that exists
+      UnknownTask        use an existing kind of task or behaviour
+      UnknownStrategy    use an existing consensus strategy
+      UnknownAgent       use an existing agent
       Undeployable       correct the module and push it again as a higher version
-      BadFault           name a fault that exists, with values in range
+      BadFault           use an existing kind of fault, with values in range
 """
 
 from __future__ import annotations
 
 
 class SwarmError(Exception):
-    """Base class of the node's exceptions; ``str()`` is one line that says what to do."""
+    """Base class of the node's exceptions; ``str()`` is one line with the problem and the remedy."""
 
 
 class BadSetting(SwarmError):
-    """A setting is invalid; ``file`` is empty for the command line."""
+    """A setting is invalid; ``file`` is its settings file, empty for a command-line flag."""
 
     def __init__(self, file: str, key: str, problem: str, remedy: str) -> None:
         super().__init__(file, key, problem, remedy)
@@ -34,7 +34,7 @@ class BadSetting(SwarmError):
 
 
 class MissingExtra(SwarmError):
-    """The libraries of an optional part are not installed."""
+    """The libraries that an optional part needs are not installed."""
 
     def __init__(self, part: str, extra: str) -> None:
         super().__init__(part, extra)

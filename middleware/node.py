@@ -1,7 +1,7 @@
 """SwarmNode: one Twisted service that connects the packages of the middleware.
 
-Its methods serve a device and its agent: announce the presence, list devices and tasks, submit and follow a
-task, request a lease from a task's council, stream camera frames, and call a peer by name.
+Its methods serve a device and its agent: announce the presence, list devices and tasks, submit and follow a task,
+request a lease from a task's council, stream camera frames, and call methods of peers.
 """
 
 from __future__ import annotations
@@ -60,10 +60,10 @@ if TYPE_CHECKING:
 CAMERA = "camera"
 LEASE_VERBS = ("prepare", "propose", "release", "close", "cancel", "change", "install", "freed")
 PLACE_CHECK_INTERVAL_S = 0.3
-"""Seconds between two checks of a new node whether others took the same place in the order of joining."""
+"""Seconds between two checks of a new node for devices with the same number in the order of joining."""
 MAX_PLACE_CHECKS = 10
 FIGURES_INTERVAL_S = 2.0
-"""Seconds between two updates of the node's network figures in its presence; in a large team one minute."""
+"""Seconds between two updates of the node's network figures in its presence; one minute in a large team."""
 REVIEW_INTERVAL_S = 10.0
 """Seconds between two checks of the size of the team."""
 
@@ -72,10 +72,10 @@ class SwarmNode(Service):
     """One node of a team.
 
     ``device`` is the node's own description; ``wall`` returns seconds since the epoch, for display only; ``admission``
-    is the admission check.  ``team`` is the closed team of that check, None in an open team; it starts and stops with
-    the node.  ``deployed`` holds the modules that operators pushed and the device's owner allowed; ``stop_deployed``
-    ends their processes.  ``stop_state`` is the stop state of the whole team.  ``later(seconds, call, ...)`` is a timer
-    that ends with the node.
+    is the admission check.  ``team`` is the closed team that the check protects, None in an open team; it is started
+    and stopped with the node.  ``deployed`` contains the modules that operators pushed and the device's owner allowed;
+    ``stop_deployed`` ends the processes of these modules.  ``stop_state`` is the stop state of the whole team.
+    ``later(seconds, call, ...)`` calls ``call`` after ``seconds``, unless the node is stopped first.
     """
 
     _log = Logger()
@@ -140,7 +140,7 @@ class SwarmNode(Service):
         Deferred.fromCoroutine(self._join()).addErrback(self._log_join_failure)
 
     def stopService(self) -> None:
-        """Send goodbye and close everything except the store, which its opener closes."""
+        """Send goodbye and close everything except the store, which is closed by the code that opened it."""
         self._leave(self.entangled.stop)
 
     def stop_silently(self) -> None:
@@ -162,7 +162,7 @@ class SwarmNode(Service):
         await self.entangled.join(self._known_nodes)
         others = await self._find_others()
         depth = await self.directory.choose_initial_depth()
-        if depth:  # the devices are in other parts of the directory now
+        if depth:  # at this depth the neighbourhood contains different devices
             others = await self._find_others()
         previous = [d.joined for d in others if d.uuid == self.uuid]
         self.presence.device = replace(self._with_address(self.presence.device), depth=depth)
@@ -190,10 +190,10 @@ class SwarmNode(Service):
         self.presence.change(network={"contacts": contacts, "records": records, "dropped": dropped})
 
     async def _resolve_place(self) -> None:
-        """Resolve equal places of devices that joined at the same time.
+        """Resolve equal numbers of devices that joined at the same time.
 
-        Each device moves behind all devices with its place and a lower uuid, in one step, so that many devices are
-        in order after one exchange of presences, not after one per device.
+        In one step, each device moves behind all devices that have the same number and a lower uuid.  So even many
+        devices are in order after one exchange of presences, instead of one exchange per device.
         """
         for _ in range(MAX_PLACE_CHECKS):
             await self._background.sleep(PLACE_CHECK_INTERVAL_S)
@@ -207,7 +207,10 @@ class SwarmNode(Service):
                 return
 
     async def _find_others(self) -> list[Device]:
-        """Return the present devices (in a large team those around this one); retry until the directory answers."""
+        """Return the present devices; retry until the directory answers.
+
+        In a large team, return only this device and its neighbours.
+        """
         while True:
             try:
                 return [device for device, _ in parse_devices(await self.directory.read_neighbourhood())]
@@ -218,7 +221,7 @@ class SwarmNode(Service):
                 await self._background.sleep(PLACE_CHECK_INTERVAL_S)
 
     def _with_certified_name(self, device: Device) -> Device:
-        """Return ``device`` with the name in its certificate, if it has one."""
+        """Return ``device`` with the name in this node's certificate, if there is one."""
         return replace(device, name=self._admission.find_authority(self.entangled.identity.public).name or device.name)
 
     def _with_address(self, device: Device) -> Device:
@@ -231,14 +234,14 @@ class SwarmNode(Service):
     # -- devices ----------------------------------------------------------------------------------------------------
 
     def watch_devices(self, changed: OnChanged, keep: bool = False) -> DeviceSubscription:
-        """Watch the devices of the team; ``parse_devices`` reads the records, ``keep`` also stores them.
+        """Watch the devices of the team; ``parse_devices`` decodes the records, ``keep`` also stores the records.
 
-        In a large team each update takes a round of reads, and ``keep`` has no effect.
+        In a large team each update requires one round of reads, and ``keep`` has no effect.
         """
         return DeviceSubscription(self.directory, changed, keep)
 
     def list_devices(self) -> Deferred[Listing]:
-        """Fire with all present devices; the list says whether it is complete.  Never fails."""
+        """Fire with all present devices; ``is_complete`` is False if devices may be missing.  Never fails."""
         return Deferred.fromCoroutine(self.directory.list_devices())
 
     def find_devices(
@@ -248,7 +251,10 @@ class SwarmNode(Service):
         return Deferred.fromCoroutine(self.directory.find_devices(count, matches, after))
 
     def find_contact(self, record: Record) -> Contact | None:
-        """Return the contact of the device that wrote ``record``; the observed address wins over the published one."""
+        """Return the contact of the device that wrote ``record``.
+
+        An observed address has priority over the published address.
+        """
         pair = next(iter(parse_devices([record])), None)
         if pair is None:
             return None
@@ -264,7 +270,7 @@ class SwarmNode(Service):
         return estimate_team_size(overlay.own_id, overlay.contacts(), overlay.is_large)
 
     def find_contacts(self, uuids: Sequence[str]) -> list[Contact]:
-        """Return the contacts of the given devices that this node knows."""
+        """Return the contacts that this node knows among the given devices."""
         return [contact for contact in self.entangled.overlay.contacts() if contact.node_id.hex() in uuids]
 
     def on_message(self, receive: Callable[[str], None]) -> None:
@@ -272,13 +278,13 @@ class SwarmNode(Service):
         self._on_message = receive
 
     def on_disconnect(self, leave: Callable[[float], None]) -> None:
-        """Call ``leave(seconds)`` when an operator disconnects this device from the network for so many seconds."""
+        """Call ``leave(seconds)`` when an operator disconnects this device from the network for ``seconds``."""
         self._on_disconnect = leave
 
     # -- tasks ------------------------------------------------------------------------------------------------------
 
     async def submit(self, task: Task) -> Task:
-        """Publish ``task`` with its council, the nodes closest to its key now (rule 1); raise ``UnknownStrategy``."""
+        """Publish ``task`` with its council, the nodes that are now closest to its key; raise ``UnknownStrategy``."""
         if not is_deployed(task.strategy):  # only nodes with the deployed module can check it
             find_import_path(task.strategy)
         task = await self.council_manager.choose_council(task)
@@ -286,11 +292,11 @@ class SwarmNode(Service):
         return task
 
     def watch_tasks(self, changed: OnChanged, keep: bool = False) -> Watch:
-        """Watch the tasks of the team; ``keep`` also stores them."""
+        """Watch the tasks of the team; ``keep`` also stores their records."""
         return self.entangled.watch(TASKS, changed, keep)
 
     def watch_group(self, task_id: str, changed: OnChanged, keep: bool = False) -> Watch:
-        """Watch the reports and the result of one task; ``keep`` also stores them."""
+        """Watch the reports and the result of one task; ``keep`` also stores their records."""
         return self.entangled.watch(group_key(task_id), changed, keep)
 
     def join_group(
@@ -300,10 +306,10 @@ class SwarmNode(Service):
         ordered: OnChanged = lambda records: None,
         reporters: Reporters | None = None,
     ) -> Group:
-        """Take part in a task, and bid for it if it has a council.
+        """Take part in a task; bid for it if the task has a council.
 
-        In a large team only the reporters (``reporters``) of a task with a council write records, except for tasks that
-        are divided among devices, which need the records of all participants.
+        If the task has a council, in a large team only its reporters (``reporters``) write records.  A task that
+        belongs to a group is an exception: its assignment needs the records of all participants.
         """
         from middleware.consensus.bidding.reporters import make_reporters
 
@@ -323,7 +329,7 @@ class SwarmNode(Service):
         return self.auction_service.take_part(auction, on_summary)
 
     def record_order(self, task_id: str, order: bytes) -> Deferred[Stored]:
-        """Record an operator's order to a running task (``middleware.tasks.order``, packed)."""
+        """Record an operator's order about a running task; ``order`` is a packed ``middleware.tasks.order.Order``."""
         return self.entangled.put(group_key(task_id), ORDER, order, "team")
 
     def record_result(self, task_id: str, result: Result) -> Deferred[Stored]:
@@ -331,14 +337,14 @@ class SwarmNode(Service):
         return self.entangled.put(group_key(task_id), RESULT, result.pack(), "team")
 
     def publish_decision_record(self, record: DecisionRecord) -> None:
-        """Publish a decision record of this node's agent; it outlives this node's lease."""
+        """Publish a decision record of this node's agent; the record remains when this node leaves."""
         put = maybeDeferred(self.entangled.put, record.key, record.slot, record.pack(), "team")
         self._log_failures(put)
 
     async def cancel(self, task: Task, result: Result) -> Stored:
-        """Record that ``task`` was cancelled and close its council; return when no agent can act on it.
+        """Record that ``task`` was cancelled and close its council; return when no agent can act on the task.
 
-        If the council is unreachable only the record is written; the acting agent stops when it receives that.
+        If the council is unreachable, only the record is written; the acting agent stops when it receives that record.
         """
         written = self.record_result(task.task_id, result)
         with suppress(EntangledError):
@@ -346,11 +352,11 @@ class SwarmNode(Service):
         return await written
 
     def get_strategy(self, name: str) -> GuardedStrategy:
-        """Return the strategy ``name`` in its guard, kept until this node stops; raise ``UnknownStrategy``."""
+        """Return the strategy ``name`` in its guard, which is loaded once per node; raise ``UnknownStrategy``."""
         return self._strategies.get(name, self.deployed)
 
     def _make_view(self, strategy: str) -> ReportView:
-        """Return the report fields that a strategy reads; only the costs if it does not exist."""
+        """Return the report fields that ``strategy`` reads; only the costs if there is no such strategy."""
         from middleware.consensus.report_view import ReportView, make_view
 
         try:
@@ -359,14 +365,14 @@ class SwarmNode(Service):
             return ReportView()
 
     def make_lease_client(self, task: Task, changed: Callable[[], None], floor: int) -> LeaseClient:
-        """Return this node's proposer for the lease on ``task``; it calls ``changed`` at each change of state.
+        """Return this node's client for the lease on ``task``; it calls ``changed`` at each change of state.
 
         ``floor`` is the highest fencing token that the node's device has obeyed; new tokens are higher.
         """
         return self.council_manager.make_lease_client(task, changed, floor)
 
     async def _record_council(self, task: Task) -> None:
-        """Record the present council of ``task``, unless it or a newer one is recorded already."""
+        """Record the current council of ``task``, unless this council or a newer one is already recorded."""
         from middleware.consensus.lease.charter import parse_charter
 
         charter = parse_charter(task.charter)
@@ -376,13 +382,13 @@ class SwarmNode(Service):
                 await self.entangled.put(group_key(task.task_id), COUNCIL, task.charter, "team")
 
     async def _with_present_council(self, task: Task) -> Task:
-        """Return ``task`` with the newest council on record."""
+        """Return ``task`` with the newest recorded council."""
         return with_newest_council(task, await self.entangled.get(group_key(task.task_id)))
 
     @cached_property
     def council_manager(self) -> CouncilManager:
-        """The councils of tasks: this node's acceptors, and its proposers."""
-        # Imported on first use: a node without councils saves the memory.
+        """The councils of tasks: this node's acceptors and lease clients."""
+        # Imported on first use, so a node that takes part in no council saves the memory.
         from middleware.tasks.council_manager import CouncilManager
 
         def moved(task: Task) -> None:
@@ -404,7 +410,7 @@ class SwarmNode(Service):
     @cached_property
     def _strategies(self) -> StrategyRegistry:
         """The strategies loaded on this node."""
-        # Imported on first use: a node that neither decides nor carries bids saves the memory.
+        # Imported on first use, so a node that neither decides nor forwards bids saves the memory.
         from middleware.consensus.strategy_registry import StrategyRegistry
 
         strategies = StrategyRegistry()
@@ -414,7 +420,7 @@ class SwarmNode(Service):
     @cached_property
     def auction_service(self) -> AuctionService:
         """This node's part in flooding the bids for tasks."""
-        # Imported on first use: a node that carries no bids saves the memory.
+        # Imported on first use, so a node that forwards no bids saves the memory.
         from middleware.consensus.bidding.auction_service import AuctionService, Environment
 
         entangled = self.entangled
@@ -474,8 +480,8 @@ class SwarmNode(Service):
 
     def _answer_disconnect(self, peer: Contact, seconds: float) -> str:
         if not 0 < seconds <= 3600:
-            raise Refused("a device disconnects for more than 0 and at most 3600 seconds")
-        # Leave after the answer was sent.
+            raise Refused("the duration of a disconnection must be more than 0 and at most 3600 seconds")
+        # Leave after the answer has been sent.
         self._background.later(0.05, self._on_disconnect, float(seconds))
         return "leaving"
 

@@ -1,4 +1,4 @@
-"""Admission check of a closed team: verify passes against the membership list.
+"""Admission check of a closed team: verify certificates with the membership list.
 
 The module ``roles`` defines the permissions of each role.
 """
@@ -41,11 +41,11 @@ MAX_GUESTS_PER_GATEWAY = 64
 AUTHORITY_CACHE_S = 1.0
 """Seconds for which an owner's authority is cached, unless the membership list changes."""
 INCARNATION_NOTE = "admission/life"
-"""Name of the stored note with the number of the node's last life."""
+"""Name of the stored note with the number of the node's last incarnation."""
 
 
 def start_incarnation(store: Store, wall: float, rng: random.Random) -> Incarnation:
-    """Start a new life with a higher number than the last one, and store the number in ``store``."""
+    """Start a new incarnation with a higher number than the last one, and store the number in ``store``."""
     try:
         last = int(store.get_note(INCARNATION_NOTE) or b"0")
     except ValueError:  # damaged file
@@ -57,10 +57,10 @@ def start_incarnation(store: Store, wall: float, rng: random.Random) -> Incarnat
 
 
 class ClosedAdmission:
-    """Verify passes against the membership list ``membership_list``; implements ``AdmissionCheck``.
+    """Verifies certificates with ``membership_list``; implements ``AdmissionCheck``.
 
-    ``membership`` returns this node's own membership.  Verified passes are cached by digest, so each pass costs its
-    signature checks once.
+    ``membership`` returns this node's own membership.  Verified certificates are cached by digest, so the signatures of
+    each certificate are checked only once.
     """
 
     max_pass_bytes = MAX_CERTIFICATE_BYTES
@@ -83,7 +83,7 @@ class ClosedAdmission:
         self._session_members: OrderedDict[bytes, Member] = OrderedDict()
         self._unlisted_certificates: dict[
             bytes, bytes
-        ] = {}  # passes of members in ``_session_members`` that are not on the list
+        ] = {}  # certificates of members in ``_session_members`` that are not on the list
         self._authorities: dict[bytes, Authority] = {}
         self._cached_at = (b"", 0.0)
 
@@ -94,13 +94,13 @@ class ClosedAdmission:
 
     @property
     def own_pass(self) -> bytes:
-        """The pass to show: the operator's latest grant, or the pass issued at admission, with its latest renewal."""
+        """This node's certificate: the operator's latest grant, or that of its admission, with the latest renewal."""
         return self._membership_list.find_best_certificate(
             self._own_member, self._membership().certificate, self._wall()
         )
 
     def find_refusal(self, public: bytes, peer_pass: bytes) -> str:
-        """Return the refusal for a node with key ``public`` and pass ``peer_pass``; empty if it is accepted."""
+        """Return the refusal for a node with key ``public`` and certificate ``peer_pass``; empty if it is accepted."""
         try:
             member = self._verify_certificate(public, peer_pass)
         except RemoteError:
@@ -111,7 +111,7 @@ class ClosedAdmission:
         ) or self._check_guest_quota(member)
 
     def admit(self, public: bytes, peer_pass: bytes) -> str:
-        """Judge a node that has confirmed its session, and remember it if it is accepted."""
+        """Check a node that has confirmed its session, and remember the node if it is accepted."""
         refusal = self.find_refusal(public, peer_pass)
         if not refusal:
             member = self._verify_certificate(public, peer_pass)
@@ -138,8 +138,8 @@ class ClosedAdmission:
     def _add_to_list(self, public: bytes, peer_pass: bytes, member: Member) -> str:
         """Add a member to the membership list, so that all nodes know it and the operator can revoke it by name.
 
-        Returns a refusal if the list is full, because only listed keys are members.  Guests are not listed; their
-        gateway is.  Unknown renewals are listed, too.
+        Returns a refusal if the list is full, because only listed keys are members.  Guests are not listed, but their
+        gateway is.  Renewals that are not on the list yet are also added.
         """
         entries = extract_entries(public, peer_pass) if member.gateway is None else []
         is_off_roll = self.is_unlisted(public)
@@ -190,7 +190,7 @@ class ClosedAdmission:
         return found
 
     def find_certificate(self, owner: bytes) -> bytes:
-        """Return an owner's pass: the operator's latest grant, or the pass it showed; empty if neither is known."""
+        """Return an owner's certificate, the latest grant or the one that it sent; empty if unknown."""
         if owner == self._own_member.public:
             return self.own_pass
         now, grant, admission = (
@@ -215,7 +215,7 @@ class ClosedAdmission:
         return known == (None, None, None)
 
     def add_certificate(self, owner: bytes, certificate: bytes) -> bool:
-        """Accept an owner's pass that another node relayed; returns whether it is valid."""
+        """Accept an owner's certificate that another node relayed; return whether it is valid."""
         return not self.admit(owner, certificate)
 
     def find_member(self, public: bytes) -> Member | None:
@@ -230,7 +230,7 @@ class ClosedAdmission:
         )
 
     def remove_former_members(self) -> list[tuple[bytes, str]]:
-        """Return and forget the nodes met that are no longer members, each with its refusal."""
+        """Remove nodes with sessions that are no longer members; return each with its refusal."""
         now = self._wall()
         gone = [
             (public, refusal)

@@ -4,7 +4,7 @@
 
     EntangledError
       LocalError
-        BadCode       check the code, or ask for another one
+        BadCode       check the code, or ask for a new code
         BadKeyFile    fix the file, its mode or its path
       Refused
         NotWelcome    ask the team's operator; ``code`` is the reason
@@ -39,7 +39,7 @@ class BadKeyFile(LocalError):
 
 
 class NotWelcome(Refused):
-    """The team rejects this newcomer; ``code`` is a key of ``REFUSAL_TEXTS``."""
+    """The team rejects the newcomer; ``code`` is a key of ``REFUSAL_TEXTS``."""
 
     code = "unknown"
 

@@ -20,11 +20,11 @@ from middleware.entangled.errors import EntangledError, Full, RemoteError
 from middleware.entangled.wire.endpoint import Endpoint
 
 FANOUT = 8
-"""Number of members that a node sends a new entry to.  More means fewer hops and more traffic."""
+"""Number of members to which a node sends a new entry; a higher number means fewer hops and more traffic."""
 COMPARE_INTERVAL_S = 5.0
-"""Seconds between two comparisons.  Less catches up sooner after a partition."""
+"""Seconds between two comparisons; with a shorter time, members catch up sooner after a partition."""
 MAX_PUSHED_ENTRIES = 8
-"""Maximum number of entries that are pushed at once."""
+"""Maximum number of new entries that are pushed together."""
 MAX_PAGE_ENTRIES = 32
 MAX_PAGE_BYTES = 65_536 + 16_384
 

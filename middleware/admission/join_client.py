@@ -1,6 +1,6 @@
 """Client side of admission: send join requests to bootstrap nodes, one after the other, until one replies.
 
-It needs a code and one or more addresses, and returns a ``Membership``.
+The client needs a code and one or more addresses, and returns a ``Membership``.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ JOIN_TIMEOUT_S = 20.0
 FIRST_RETRY_S, RETRY_GROWTH, TRIES_PER_ADDRESS = 0.25, 1.6, 4
 """Seconds until a request is repeated, growth factor of that delay, and requests per address in a row."""
 FINAL_REFUSALS = ("used", "expired", "early", "revoked", "name", "foreign")
-"""Refusals that are the same at every bootstrap node."""
+"""Refusals that every bootstrap node would give."""
 MAX_ADDRESSES = 64
 
 
@@ -100,7 +100,7 @@ class JoinClient:
         try:
             reply = join_codec.open_reply(datagram, self._code, self._public, self._ephemeral)
         except RemoteError:
-            return  # a member that is not a bootstrap node can have sent it; the valid reply can still arrive
+            return  # a member that is not a bootstrap node may have sent it; the valid reply can still arrive
         if isinstance(reply, UnsignedRefusal):
             self._try_next(reply.code, source)
         elif isinstance(reply.content, JoinReply):
@@ -111,7 +111,7 @@ class JoinClient:
             self._try_next(reply.content, source)
 
     def _try_next(self, code: str, source: Address) -> None:
-        """Try the next address: that node may admit the newcomer, or the same node may later."""
+        """Try the next address, because that node may admit the newcomer; this address is tried again later."""
         self._last_refusal = code
         if source == self._addresses[self._address_index % len(self._addresses)]:
             self._select_next_address()
@@ -137,7 +137,7 @@ class JoinClient:
             self._fail(NotWelcome(self._last_refusal))
             return
         addresses = ", ".join(map(str, self._addresses)) or "no bootstrap node found"
-        remedy = "name the address of a bootstrap node that runs (swarm join CODE --at HOST:PORT)"
+        remedy = "give the address of a running bootstrap node (swarm join CODE --at HOST:PORT)"
         self._fail(NoAnswer(f"no reply to the join request ({addresses}); {remedy}, and check that UDP is not blocked"))
 
     def _fail(self, error: Exception) -> None:

@@ -93,12 +93,12 @@ def parse_code(text: str) -> JoinCode:
     letters = text.upper().translate(NORMALIZATION)
     wrong = next((letter for letter in letters if letter not in ALPHABET), "")
     if wrong:
-        raise BadCode(f"the code contains {wrong!r}; a code has only digits and letters without U; check it")
+        raise BadCode(f"the code contains {wrong!r}; a code has only digits and letters except U; check the code")
     if len(letters) != CODE_LENGTH:
-        raise BadCode(f"a code has {CODE_LENGTH} characters, this one has {len(letters)}; check it")
+        raise BadCode(f"a code has {CODE_LENGTH} characters, this one has {len(letters)}; check the code")
     digits = [ALPHABET.index(letter) for letter in letters]
     if _compute_check(digits[:-1]) != digits[-1]:
-        raise BadCode("the code is mistyped: its check character does not match; check it")
+        raise BadCode("the code is mistyped: its check character does not match; type it again")
     return JoinCode(_decode(digits[:_SECRET_LETTERS]), _decode(digits[_SECRET_LETTERS:-1]))
 
 
@@ -119,7 +119,9 @@ def seal_terms(code: JoinCode, content: TermsContent, rng: random.Random) -> byt
         body, _ASSOCIATED_DATA, nonce, code.terms_key
     )
     if len(sealed) > MAX_TERMS_BYTES or len(content.settings) > MAX_SETTINGS:
-        raise ValueError(f"the settings for newcomers take {len(sealed)} bytes, at most {MAX_TERMS_BYTES}; share fewer")
+        raise ValueError(
+            f"the settings for newcomers take {len(sealed)} bytes, at most {MAX_TERMS_BYTES}; share fewer settings"
+        )
     return sealed
 
 
@@ -130,7 +132,7 @@ def open_terms(code: JoinCode, sealed: bytes) -> TermsContent:
             sealed[_NONCE_BYTES:], _ASSOCIATED_DATA, sealed[:_NONCE_BYTES], code.terms_key
         )
     except (CryptoError, ValueError) as error:
-        raise Forged("the code does not decrypt these terms") from error
+        raise Forged("the terms cannot be decrypted with this code") from error
     try:
         operator, team, settings = msgpack.unpackb(body, max_map_len=MAX_SETTINGS, max_ext_len=0, max_array_len=3)
         if not all(isinstance(k, str) and isinstance(v, str | int | float | bool) for k, v in settings.items()):
@@ -141,7 +143,7 @@ def open_terms(code: JoinCode, sealed: bytes) -> TermsContent:
     except Exception as error:  # untrusted bytes
         raise Malformed("the terms have invalid fields") from error
     if not code.matches_operator(content.operator):
-        raise Forged("the terms are from another operator than the code names")
+        raise Forged("the terms are from a different operator than the code")
     return content
 
 

@@ -8,11 +8,11 @@
 
 The psk is derived from the invitation's *public* key, which members know from the membership list and the holder of the
 code can derive.  A JOIN_REQUEST that decrypts therefore comes from a member or from a holder of the code, and strangers
-cannot read it.  The psk does not authenticate the replying node.  Three parts of a JOIN_REPLY do, because other members
-cannot forge them: the encrypted ``terms`` of the invitation, from which only the newcomer learns the operator's key;
-the replying node's grant by that operator with the role bootstrap; and that node's signature over the content and both
-keys of the newcomer.  A JOIN_REPLY is never longer than its JOIN_REQUEST.  The modules ``join_client`` and ``server``
-implement the two sides.
+cannot read it.  The psk does not authenticate the replying node.  Three parts of a JOIN_REPLY do this, because other
+members cannot forge them: the encrypted ``terms`` of the invitation, from which only the newcomer learns the operator's
+key; the replying node's grant by that operator with the role bootstrap; and that node's signature over the content and
+both keys of the newcomer.  A JOIN_REPLY is never longer than its JOIN_REQUEST.  The modules ``join_client`` and
+``server`` implement the two sides.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class Signer:
 
 @dataclass(frozen=True)
 class JoinReply:
-    """Content of a join reply: pass, team secrets and contacts; ``secrets`` are as in ``Membership``."""
+    """Content of a join reply: certificate, team secrets and contacts; ``secrets`` are as in ``Membership``."""
 
     certificate: bytes
     secrets: tuple[tuple[int, bytes, int], ...] = field(repr=False)
@@ -78,7 +78,7 @@ class JoinReply:
 
 
 class VerifiedReply(NamedTuple):
-    """A signed reply: the welcome or the code of a refusal, with the decrypted terms."""
+    """A signed reply: the content of a join reply or the code of a refusal, with the decrypted terms."""
 
     terms: TermsContent
     content: JoinReply | str
@@ -126,7 +126,7 @@ def open_request(datagram: bytes, invitation: bytes) -> JoinRequest:
             datagram[_HEAD_BYTES + _NONCE_BYTES :], head, nonce, derive_psk(invitation)
         )
     except (CryptoError, ValueError) as error:
-        raise Forged("the join request does not decrypt") from error
+        raise Forged("the join request cannot be decrypted") from error
     unpacker = msgpack.Unpacker(max_buffer_size=_BODY_BYTES, max_map_len=0, max_ext_len=0, max_array_len=4)
     unpacker.feed(body)
     try:
@@ -173,7 +173,7 @@ def open_reply(datagram: bytes, code: JoinCode, public: bytes, ephemeral: bytes)
     """
     invitation = code.key.public
     if read_invitation_id(datagram) != invitation_id(invitation):
-        raise Forged("the join reply names another invitation")
+        raise Forged("the join reply is for a different invitation")
     if len(datagram) <= _HEAD_BYTES + MAX_REFUSAL_CODE_BYTES:
         refusal_code = datagram[_HEAD_BYTES:].decode("ascii", "replace")
         return UnsignedRefusal(refusal_code if refusal_code in REFUSAL_TEXTS else "unknown")
@@ -202,7 +202,7 @@ def _parse_content(packed: bytes) -> JoinReply | str:
         return fields[0] if fields[0] in REFUSAL_TEXTS else "unknown"
     certificate, secrets, contacts = fields
     if not isinstance(certificate, bytes) or len(certificate) > MAX_CERTIFICATE_BYTES or not secrets:
-        raise Malformed("the join reply has no pass or no secret")
+        raise Malformed("the join reply has no certificate or no secret")
     found = tuple(
         (check_number(number), check_bytes(secret, SECRET_BYTES), check_number(until))
         for number, secret, until in secrets

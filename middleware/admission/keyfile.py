@@ -17,7 +17,7 @@ MAX_FILE_BYTES = 2**20
 
 
 def read(path: Path) -> dict[str, Any]:
-    """Return the mapping in the file at ``path``; raises ``BadKeyFile``, also if other users can read it."""
+    """Return the mapping in the file at ``path``; raise ``BadKeyFile``, also if other users can read the file."""
     content = read_bytes(path)
     try:
         found = json.loads(content)
@@ -34,7 +34,7 @@ def read_bytes(path: Path) -> bytes:
         with open(path, "rb") as file:
             state = os.fstat(file.fileno())
             if not stat.S_ISREG(state.st_mode):
-                raise BadKeyFile(f"{path} is not a regular file; name the file itself")
+                raise BadKeyFile(f"{path} is not a regular file; use the path of the file itself")
             if state.st_mode & 0o077:
                 mode = stat.S_IMODE(state.st_mode)
                 raise BadKeyFile(
@@ -49,7 +49,7 @@ def read_bytes(path: Path) -> bytes:
 def write(path: Path, content: Mapping[str, Any], is_new: bool = False) -> None:
     """Replace the file at ``path`` with ``content``, or create it if ``is_new``; raises ``BadKeyFile``.
 
-    A concurrent reader, and a reader after a power failure, finds either the old or the new content.
+    A concurrent reader, or a reader after a power failure, gets either the old or the new content.
     """
     fresh = path.with_name(f".{path.name}.{os.getpid()}")
     if is_new and path.exists():

@@ -1,7 +1,7 @@
 """Membership file of a member of a closed team: identity, certificate and team secrets.
 
-The file is a secret: a holder of it can act as this member.  It is refused if other users can read it, and replaced
-when the team's secret is rotated or the operator issues another grant.
+The file is secret: whoever has the file can act as this member.  A file that other users can read is rejected.  The
+file is replaced when the team's secret is rotated or the operator issues a new grant.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ MAX_KNOWN_NODES = 64
 class Membership:
     """One member's keys and secrets.
 
-    ``operator`` is the operator's public key.  ``secrets`` are the team's secrets, newest first, each as a number, the
-    secret, and the wall clock time until which the secrets before it are accepted.  ``known`` are addresses of
-    bootstrap nodes, and ``settings`` the settings that the team gives to each node.
+    ``operator`` is the operator's public key.  ``secrets`` are the team's secrets, the newest first.  Each is a tuple
+    of its number, the secret, and the wall-clock time until which earlier secrets are accepted.  ``known`` are
+    addresses of bootstrap nodes, and ``settings`` the settings that the team gives to each node.
     """
 
     team: str
@@ -48,7 +48,7 @@ class Membership:
 
     @property
     def member(self) -> Member:
-        """The member described by the pass; raises ``BadKeyFile`` if the pass is not of this team."""
+        """The member described by the certificate; raises ``BadKeyFile`` if the certificate is not of this team."""
         try:
             return verify_certificate(self.operator, self.identity.public, self.certificate)
         except RemoteError as error:
@@ -85,13 +85,13 @@ def parse_membership(found: Mapping[str, Any]) -> Membership:
     """Parse the content of a membership file; raises ``BadKeyFile``."""
     try:
         if found["kind"] != KIND:
-            raise ValueError("another kind of file")
+            raise ValueError("a different kind of file")
         secrets = [
             (check_number(number, 1), check_bytes(bytes.fromhex(secret), SECRET_BYTES), check_number(until))
             for number, secret, until in found["secrets"][:MAX_SECRETS]
         ]
         if not secrets:
-            raise ValueError("no secret of the team")
+            raise ValueError("the team's secret is missing")
         known = [
             Address(str(host), check_number(port, 1, 65535)) for host, port in found["known_nodes"][:MAX_KNOWN_NODES]
         ]
@@ -110,7 +110,9 @@ def parse_membership(found: Mapping[str, Any]) -> Membership:
             dict(found["settings"]),
         )
     except (KeyError, ValueError, TypeError, RemoteError) as error:
-        raise BadKeyFile(f"not a valid membership ({error}); join again, or restore it from a backup") from error
+        raise BadKeyFile(
+            f"the membership is not valid ({error}); join again, or restore the file from a backup"
+        ) from error
     # Verify the certificate now and not at the first handshake.
     assert membership.member
     return membership
@@ -146,7 +148,7 @@ class MemoryMembership:
 
 
 def create_membership_file(path: Path, membership: Membership) -> None:
-    """Create the file of a new member; raises ``BadKeyFile``, also if it exists."""
+    """Create the file of a new member; raise ``BadKeyFile``, also if the file exists."""
     keyfile.write(path, membership.to_json(), is_new=True)
 
 

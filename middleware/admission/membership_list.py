@@ -1,10 +1,11 @@
 """Membership list of a closed team: the operator's statements and the admissions that a node knows.
 
 Entries are only added, until they expire, so the list is a grow-only set: two nodes with the same statements have the
-same state, in whatever order the statements arrived.  Of two statements about the same subject the later one wins, and
-the other is dropped.  The list also contains admissions (a newcomer's key with the pass that a bootstrap node issued),
-so that names stay unique, a newcomer gets the same reply from every bootstrap node, and the operator sees the members;
-and the newest renewal of each key, which changes only the end date of its grant or admission.
+same state, in whatever order the statements arrived.  Of two statements about the same subject, the later one is valid,
+and the other is dropped.  The list also contains admissions: the key of a newcomer with the certificate that a
+bootstrap node issued.  With these, names stay unique, a newcomer gets the same reply from every bootstrap node, and the
+operator can list the members.  The list also contains the newest renewal of each key, which changes only the end date
+of its grant or admission.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ INVITATION_ID_BYTES = 8
 
 @dataclass(frozen=True)
 class SignedCertificate(Entry):
-    """The pass of a member, signed by a bootstrap node."""
+    """The certificate of a member, signed by a bootstrap node."""
 
     member: Member
     certificate: bytes
@@ -83,7 +84,7 @@ class Admission(SignedCertificate):
 
     @property
     def rank(self) -> int:
-        """The later admission wins."""
+        """The sort key: the later admission is valid."""
         return self.member.not_before
 
 
@@ -99,7 +100,7 @@ class Renewal(SignedCertificate):
 
     @property
     def rank(self) -> int:
-        """The renewal that ends later wins, so no bootstrap node can shorten another one's renewal."""
+        """The sort key: the renewal that ends later is valid, so no bootstrap node can shorten that of another."""
         return self.member.not_after
 
 
@@ -119,12 +120,12 @@ def compute_digest(packed: bytes) -> bytes:
 
 
 def invitation_id(public: bytes) -> bytes:
-    """Return the id by which a join request names its invitation in clear text."""
+    """Return the id of an invitation, which a join request contains in clear text."""
     return hashlib.blake2s(public, digest_size=INVITATION_ID_BYTES, person=b"invite").digest()
 
 
 def pack_admission(public: bytes, certificate: bytes) -> bytes:
-    """Pack an admission or a renewal; the pass in it is signed."""
+    """Pack an admission or a renewal; the certificate in it is signed."""
     return bytes(msgpack.packb([ADMISSION_KIND, public, certificate]))
 
 
@@ -169,7 +170,7 @@ class MembershipList:
         return compute_digest(packed) in self._entries
 
     def add(self, packed: object, now: float) -> Entry | None:
-        """Add an entry; returns it if it is new and valid, else None.
+        """Add an entry; return the entry if it is new and valid, else None.
 
         Raises ``Malformed`` or ``Forged`` for an entry that is not of this team, and ``Full`` if there is no room.
         """
@@ -274,7 +275,7 @@ class MembershipList:
         return member.check_dates(now)
 
     def update_member(self, member: Member, now: float) -> Member:
-        """Update ``member`` from its pass with the operator's latest grant and the renewal that ends last.
+        """Update ``member`` with the operator's latest grant and the renewal that ends last.
 
         A renewal applies only to the grant that it renews, and only if its signer may renew now.
         """
@@ -303,7 +304,7 @@ class MembershipList:
         return replace(found, not_after=last.not_after, renewer=last.renewer)
 
     def find_member(self, public: bytes, now: float) -> Member | None:
-        """Return the last known state of ``public``, also if it is not a member now."""
+        """Return the last known state of ``public``, even if it is no longer a member."""
         admission, grant, renewal = self.find_admission(public), self.find_grant(public), self.find_renewal(public)
         if admission is not None:
             return self.update_member(admission.member, now)
@@ -312,7 +313,7 @@ class MembershipList:
         return None if renewal is None else self.update_member(renewal.member, now)
 
     def find_best_certificate(self, member: Member, certificate: bytes, now: float) -> bytes:
-        """Return the pass with the latest end to show for ``member``, whose pass is ``certificate``."""
+        """Return the best certificate of ``member``, the one that ends last; ``certificate`` is its known one."""
         known, renewal, grant = (
             self.update_member(member, now),
             self.find_renewal(member.public),
@@ -368,7 +369,7 @@ class MembershipList:
         if len(fields) == 3 and fields[0] == ADMISSION_KIND:
             public, certificate = check_bytes(fields[1], 32), fields[2]
             if not isinstance(certificate, bytes):
-                raise Malformed("the admission has no pass")
+                raise Malformed("the admission has no certificate")
             member = verify_certificate(self.operator, public, certificate)
             if member.renewer:
                 return Renewal(member, certificate, extract_grant(self.operator, certificate))
@@ -435,7 +436,7 @@ class MembershipList:
         return member.renewer != member.public and not self._is_renewal_valid(member, now)
 
     def _drop_invalid(self, keys: Iterable[bytes], now: float) -> None:
-        """Drop entries that a revocation or a later grant invalidated; that statement also rejects them when shown."""
+        """Drop entries that a revocation or a later grant invalidated."""
         void = [key for key in keys if self._is_invalid(self._entries[key].entry, now)]
         members = [each.member for key in void if isinstance(each := self._entries[key].entry, SignedCertificate)]
         for key in void:

@@ -1,6 +1,6 @@
 """Operator of a team: sign grants, invitations, revocations and secrets with a key kept in a file outside the nodes.
 
-A holder of the file is the operator.  Without it a team cannot invite or revoke, so keep a copy.
+Whoever has the file is the operator.  Without the file, a team cannot invite or revoke members, so keep a copy.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from middleware.entangled.identity import Identity
 KIND = "swarm-node operator 1"
 FIRST_SECRET_NUMBER = 1
 FIRST_NODE_ROLES = ("device", "operator", "gateway", "bootstrap")
-"""Roles of the first node of a team: all."""
+"""Roles of the first node of a team: all except viewer."""
 
 
 class Invitation(NamedTuple):
@@ -136,7 +136,7 @@ def create_operator(team: str, rng: random.Random) -> Operator:
     try:
         return Operator(check_name(team), rng.randbytes(32))
     except RemoteError as error:
-        raise BadKeyFile("a team's name has 1 to 40 letters, digits, _ or -") from error
+        raise BadKeyFile("the name of a team must have 1 to 40 letters, digits, _ or -") from error
 
 
 def load_operator(path: Path) -> Operator:
@@ -144,13 +144,13 @@ def load_operator(path: Path) -> Operator:
     found: dict[str, Any] = keyfile.read(path)
     try:
         if found["kind"] != KIND:
-            raise ValueError("another kind of file")
+            raise ValueError("a different kind of file")
         settings = found.get("settings", {})
         if not isinstance(settings, dict):
             raise ValueError("the settings are not a mapping")
         return Operator(check_name(found["team"]), check_bytes(bytes.fromhex(found["seed"]), 32), settings)
     except (KeyError, ValueError, TypeError, RemoteError) as error:
-        raise BadKeyFile(f"{path} is not an operator's key ({error}); name the file that swarm init made") from error
+        raise BadKeyFile(f"{path} is not an operator's key ({error}); use the file that swarm init created") from error
 
 
 def create_operator_file(path: Path, operator: Operator) -> None:

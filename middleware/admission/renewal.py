@@ -1,9 +1,9 @@
 """Renewal of certificates: bootstrap nodes renew present members, so a team keeps running without its operator.
 
 Members do not ask for renewal.  Every few minutes each bootstrap node scans the membership list.  It signs a new end
-date for members that are present, are not revoked, have a renewable certificate, and have a third of its life left.
-The renewal is distributed by gossip.  Bootstrap nodes renew each other early enough that their end dates stay close
-together; the last one renews itself.
+date for each member that is present and not revoked, if the member's certificate is renewable and less than a third of
+its validity remains.  The renewal is distributed by gossip.  Bootstrap nodes renew each other early enough that their
+end dates stay close together; the last one renews itself.
 """
 
 from __future__ import annotations
@@ -20,17 +20,18 @@ from middleware.entangled.identity import Identity
 from middleware.entangled.wire.admission_check import LogLimiter
 
 SCAN_INTERVAL_S = 600.0
-"""Mean seconds between two scans of the list.  Less renews members sooner that are present only briefly."""
+"""Mean seconds between two scans of the list; with a shorter time, members that are present only briefly are renewed
+sooner."""
 RENEWAL_DIVISOR = 3
-"""A certificate is renewed when less than 1/``RENEWAL_DIVISOR`` of its life is left."""
+"""A certificate is renewed when less than 1/``RENEWAL_DIVISOR`` of its validity remains."""
 MAX_RENEWALS_PER_SCAN = 8
 """Renewals signed per scan: the renewals of a team that was founded in one day are spread over hours."""
 
 
 class Renewer:
-    """Renew certificates at one node, if it may; ``now`` is in seconds of the wall clock.
+    """Renews certificates at one node, if its role permits this; ``now`` is in seconds of the wall clock.
 
-    ``find_certificate`` returns the pass of a member, and ``add`` publishes an entry.
+    ``find_certificate`` returns the certificate of a member, and ``add`` publishes an entry.
     """
 
     _log = Logger()

@@ -97,8 +97,8 @@ COUNCIL, ENDED = "council", "done"
 OTHER = "other"
 
 BY_KEY, BY_NAME, REST = "key", "name", "rest"
-"""Ways to recognise the records of a namespace: by a key of that name, by the slot's name up to a ``/``, or as the
-remaining records."""
+"""How to recognise the records of a namespace: by a key of that name, by the slot's name up to a ``/``, or because no
+other namespace matches."""
 
 
 class Namespace(NamedTuple):
@@ -157,7 +157,7 @@ _BY_NAME = frozenset(kind for kind, namespace in NAMESPACES.items() if namespace
 def classify_slot(slot: Slot) -> str:
     """Return the kind of the records in ``slot``: by its key, otherwise by its name up to a ``/``.
 
-    In a large team each device has an own place in the directory (``prefix``).
+    In a large team, devices are listed under many keys (``middleware.directory.prefix``).
     """
     kind = _BY_KEY.get(slot.key)
     if kind is None:

@@ -13,7 +13,7 @@ from middleware.entangled.errors import Forged
 KEY_BYTES = 32
 OVERHEAD_BYTES = KEY_BYTES + 16
 _NONCE = bytes(12)
-"""Constant, because each message has a fresh key."""
+"""The nonce is constant, because each message has a new key."""
 
 
 def seal(message: bytes, to: bytes, shared: bytes, about: bytes, rng: random.Random) -> bytes:
@@ -36,12 +36,12 @@ def unseal(whole: bytes, secret: bytes, shared: bytes, about: bytes) -> bytes:
     try:
         return bindings.crypto_aead_chacha20poly1305_ietf_decrypt(whole[KEY_BYTES:], about, _NONCE, key)
     except (CryptoError, ValueError) as error:
-        raise Forged("the message does not decrypt") from error
+        raise Forged("the message cannot be decrypted") from error
 
 
 def _derive_key(secret: bytes, public: bytes, sender: bytes, receiver: bytes, shared: bytes) -> bytes:
     try:
         agreed = bindings.crypto_scalarmult(secret, public)
     except (CryptoError, RuntimeError, ValueError, TypeError) as error:
-        raise Forged("not an X25519 key") from error
+        raise Forged("the key is not a valid X25519 key") from error
     return hashlib.blake2s(agreed + sender + receiver, key=shared, person=b"sealed").digest()

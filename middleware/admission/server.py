@@ -1,7 +1,8 @@
 """Server side of admission: a bootstrap node verifies join requests and admits newcomers (thesis, Figure 4.5).
 
-A request that names an unknown invitation costs one table lookup, and one that does not decrypt costs one hash.  State
-is kept only after that, and each request gets at most one reply, never longer than the request.
+A request with an unknown invitation costs one table lookup, and a request that cannot be decrypted costs one hash.  The
+server stores state only for requests that pass these checks.  Each request gets at most one reply, which is never
+longer than the request.
 """
 
 from __future__ import annotations
@@ -36,12 +37,12 @@ MAX_CACHED_REPLIES = 256
 
 
 class AdmissionServer:
-    """Admit newcomers at a bootstrap node.
+    """Admits newcomers at a bootstrap node.
 
     ``identity`` is the node's key pair.  ``take_use`` uses up one use of an invitation, ``publish_admission`` publishes
-    an admission, ``build_reply`` returns the reply content for a pass, and ``send`` sends a datagram.  ``now`` is the
-    monotonic clock for rate limits, ``wall`` the wall clock for statements.  ``on_refused`` is called for each rejected
-    newcomer with its key (empty if the code is unknown), its address and the code of ``REFUSAL_TEXTS``.
+    an admission, ``build_reply`` returns the reply content for a certificate, and ``send`` sends a datagram.  ``now``
+    is the monotonic clock for rate limits, ``wall`` the wall clock for statements.  ``on_refused`` is called for each
+    rejected newcomer with its key (empty if the code is unknown), its address and the code of ``REFUSAL_TEXTS``.
     """
 
     _log = Logger()
@@ -106,7 +107,7 @@ class AdmissionServer:
         decided.addBoth(self._reply, request, invite, digest, source).addErrback(self._log_unexpected)
 
     async def _decide_request(self, request: JoinRequest, invite: Invite, packed: bytes) -> bytes | str:
-        """Return the pass of the newcomer, or the code of the refusal."""
+        """Return the certificate of the newcomer, or the code of the refusal."""
         now = int(self._wall())
         me, own = (
             self._membership_list.find_grant(self._identity.public),

@@ -24,7 +24,7 @@ from middleware.entangled.identity import Identity, derive_exchange_key, is_sign
 
 DOMAIN = b"swarm-team-1 "
 ROLES = ("device", "operator", "viewer", "gateway", "bootstrap")
-"""Roles of members; the position of a role is its bit on the wire."""
+"""Roles of members; the index of a role is the number of its bit in messages."""
 NAME_PATTERN = r"[A-Za-z0-9_-]{1,40}"
 NAME_PREFIX_LETTERS = 36
 """Number of letters of an invitation's name that precede the number of each newcomer."""
@@ -33,7 +33,8 @@ MAX_STATEMENT_BYTES = 65_536
 MAX_TERMS_BYTES = 320
 """Maximum size in bytes of the encrypted terms of an invitation: they have to fit into a join reply."""
 MAX_SECRET_RECIPIENTS = 500
-"""Maximum number of members to which one statement carries the team's secret; others request it from a member."""
+"""Maximum number of members for which one statement contains the team's secret; others request the secret from a
+member."""
 MAX_LIFE_S = 10 * 365 * 86_400
 """Maximum validity of a certificate, in seconds."""
 INVITATION_REMEMBERED_S = 7 * 86_400
@@ -53,7 +54,7 @@ _PUBLIC_BYTES, _SIGNATURE_BYTES, _FINGERPRINT_BYTES = 32, 64, 16
 class Entry:
     """An entry of the membership list.
 
-    Of two entries with the same ``slot`` the one with the higher ``rank`` wins.  An entry expires at
+    Of two entries with the same ``slot``, the one with the higher ``rank`` is valid.  An entry expires at
     ``kept_until``.
     """
 
@@ -69,7 +70,7 @@ class Entry:
 
     @property
     def rank(self) -> int:
-        """The later entry wins."""
+        """The sort key: the later entry is valid."""
         return self.not_before
 
     @property
@@ -96,7 +97,7 @@ class Grant(Entry):
 
     @property
     def life(self) -> int:
-        """The seconds for which the operator issued it."""
+        """The seconds for which the operator issued the certificate."""
         return self.not_after - self.not_before
 
 
@@ -163,7 +164,7 @@ class Revocation(Entry):
 
     @property
     def rank(self) -> int:
-        """The earlier revocation wins: a later one cannot change it."""
+        """The sort key: the earlier revocation is valid, so a later one cannot change it."""
         return -self.at
 
 
@@ -190,7 +191,7 @@ class Secret(Entry):
 
     @property
     def rank(self) -> int:
-        """The later statement wins."""
+        """The sort key: the later statement is valid."""
         return self.at
 
     def decrypt(self, member: Identity) -> bytes | None:
@@ -225,12 +226,12 @@ def seal_secret(
 
 
 def member_id(public: bytes) -> bytes:
-    """Return the id by which a revocation names a member that stays."""
+    """Return the id with which a revocation lists a member that remains a member."""
     return hashlib.blake2s(public, digest_size=MEMBER_ID_BYTES, person=b"member").digest()
 
 
 def renewal_id(public: bytes, not_after: int) -> bytes:
-    """Return the id by which a revocation names a renewal that stays: of the key ``public``, until ``not_after``."""
+    """Return the id with which a revocation lists a renewal that remains valid."""
     return hashlib.blake2s(public + not_after.to_bytes(8), digest_size=MEMBER_ID_BYTES, person=b"renewal").digest()
 
 
@@ -256,7 +257,7 @@ def sign_statement(operator: Identity, statement: Statement) -> bytes:
         raise ValueError(str(error)) from error
     packed: bytes = msgpack.packb([*fields, operator.sign(_signed_content(operator.public, fields))])
     if len(packed) > MAX_STATEMENT_BYTES:
-        raise ValueError(f"a statement has at most {MAX_STATEMENT_BYTES} bytes, this one {len(packed)}")
+        raise ValueError(f"a statement must have at most {MAX_STATEMENT_BYTES} bytes, not {len(packed)}")
     return packed
 
 
@@ -275,7 +276,7 @@ def open_statement(operator: bytes, packed: object) -> Statement:
 def unpack_fields(packed: object) -> list[Any]:
     """Unpack a msgpack array of at most ``MAX_STATEMENT_BYTES`` bytes; raises ``Malformed``."""
     if not isinstance(packed, bytes) or len(packed) > MAX_STATEMENT_BYTES:
-        raise Malformed(f"a statement has to be at most {MAX_STATEMENT_BYTES} bytes")
+        raise Malformed(f"a statement must be at most {MAX_STATEMENT_BYTES} bytes")
     try:
         fields = msgpack.unpackb(packed, max_ext_len=0, max_map_len=0, max_array_len=MAX_SECRET_RECIPIENTS)
     except Exception as error:  # untrusted bytes
@@ -379,7 +380,7 @@ def _parse_fields(fields: list[Any]) -> Statement:
         if kind == 3:
             number, at, grace, end, mark, pairs = rest
             if not isinstance(pairs, list) or not pairs:
-                raise Malformed("the secret is for no member")
+                raise Malformed("the secret has no recipient")
             size = SECRET_BYTES + OVERHEAD_BYTES
             each = tuple((check_bytes(public, _PUBLIC_BYTES), check_bytes(packed, size)) for public, packed in pairs)
             times = check_number(at), check_number(grace, 0, MAX_LIFE_S), check_number(end)

@@ -36,9 +36,9 @@ if TYPE_CHECKING:
 LIST_NOTE = "admission/roll"
 """Name of the stored note with the membership list."""
 GUESTS_NOTE, EMPTY_GUESTS = "admission/guests", bytes(msgpack.packb([]))
-"""Name of the stored note with passes of record owners that are not on the membership list."""
+"""Name of the stored note with certificates of record owners that are not on the membership list."""
 MAX_GUESTS = 256
-"""Maximum number of owners whose passes are stored; other passes are requested again from members."""
+"""Maximum number of owners whose certificates are stored; others are requested again from members."""
 
 
 class Team:
@@ -123,7 +123,7 @@ class Team:
         )
         problem = self.admission.me.check_dates(self._wall())
         if problem:
-            # Whether the clock is right is unknown at this point, so the message has both causes.
+            # The clock may be wrong, so the message contains both causes.
             self._log.warn("the certificate of this node is not valid by its clock: {why}", why=explain(problem))
         self._gossip.start()
         self._background.every(COMPARE_INTERVAL_S, self._run_periodic)
@@ -170,7 +170,7 @@ class Team:
         return self.membership_list.list_members(self._wall())
 
     def create_guest(self, seed: bytes, name: str) -> Membership:
-        """Return the membership of a guest of this node; raises ``Malformed`` if this node's pass is too long."""
+        """Return the membership of a guest of this node; raise ``Malformed`` if this node's certificate is too long."""
         own, now = self.membership, int(self._wall())
         certificate = issue_guest_certificate(self.identity, self.admission.own_pass, Identity(seed).public, name, now)
         return replace(own, seed=seed, certificate=certificate, known_nodes=())
@@ -178,7 +178,7 @@ class Team:
     # -- implementation ---------------------------------------------------------------------------------------------
 
     def _load_list(self) -> None:
-        """Load the stored membership list, and add the entries in this node's pass."""
+        """Load the stored membership list, and add the entries in this node's certificate."""
         try:
             noted = msgpack.unpackb(self._store.get_note(LIST_NOTE) or b"\x90", max_array_len=MAX_ENTRIES)
         except Exception:  # damaged file
@@ -191,13 +191,13 @@ class Team:
                 continue
 
     def _load_guest_certificates(self) -> None:
-        """Load the stored passes of guests whose records this node holds."""
+        """Load the stored certificates of guests whose records this node stores."""
         try:
             noted = msgpack.unpackb(self._store.get_note(GUESTS_NOTE) or EMPTY_GUESTS, max_array_len=MAX_GUESTS)
             for owner, certificate in noted:
                 self.admission.add_certificate(owner, certificate)
         except Exception:  # damaged file
-            self._log.warn("the stored passes of guests are damaged; other members will send them again")
+            self._log.warn("the stored certificates of guests are damaged; they are requested again from other members")
 
     def _on_new_entry(self, entry: Entry) -> None:
         self._store.set_note(LIST_NOTE, msgpack.packb(self.membership_list.list_packed()))
@@ -261,7 +261,7 @@ class Team:
         return True
 
     def _store_certificate(self) -> None:
-        """Store the current pass for the next start."""
+        """Store the current certificate for the next start."""
         self._store_membership(replace(self.membership, certificate=self.admission.own_pass))
 
     def _evict_former_members(self) -> None:
@@ -272,7 +272,7 @@ class Team:
             self._store_guest_certificates(self._node)
 
     def _store_guest_certificates(self, node: EntangledNode) -> None:
-        """Store the passes of record owners that are not on the membership list, for the next start."""
+        """Store the certificates of record owners that are not on the membership list, for the next start."""
         owners = [owner for owner in node.store.owners() if self.admission.is_unlisted(owner)][-MAX_GUESTS:]
         noted = msgpack.packb([[owner, self.admission.find_certificate(owner)] for owner in owners])
         if noted != (self._store.get_note(GUESTS_NOTE) or EMPTY_GUESTS):

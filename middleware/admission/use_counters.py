@@ -1,7 +1,7 @@
 """Use counters of invitations: each use is a tuple in the team's tuple space, which can be taken at most once.
 
 This holds for any number of bootstrap nodes, crashes and partitions.  A bootstrap node that reaches too few members
-cannot decide, and reports that.
+cannot take a use, and reports this.
 """
 
 from __future__ import annotations
@@ -33,7 +33,10 @@ class UseCounters:
         return gatherResults(puts, consumeErrors=True).addErrback(_unwrap_first_error)
 
     def take(self, invite: Invite) -> Deferred[bool]:
-        """Take one use of ``invite``; fires with whether one was left, fails with ``TransientError`` if undecidable."""
+        """Take one use of ``invite``; fire with False if no use remains.
+
+        Fails with ``TransientError`` if too few members answer.
+        """
         taken = self._space.get_if_exists((invitation_id(invite.public), int))
         return taken.addCallback(lambda found: found is not None)
 

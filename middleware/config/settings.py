@@ -1,7 +1,7 @@
-"""Settings of a node: the TOML file, checked and frozen; each setting with its unit and the effect of changing it.
+"""Settings of a node: the TOML file, checked and frozen; each setting is described with its unit and effect.
 
 Tables: ``[node]``, ``[agent]``, ``[driver]``, ``[web]``, ``[faults]`` and ``[deployment]``, one dataclass each.
-Any error is one ``BadSetting`` with the place, the problem and the remedy.
+Any error is one ``BadSetting`` with the file and key, the problem and the remedy.
 """
 
 from __future__ import annotations
@@ -49,65 +49,72 @@ class NodeSettings:
     default accepts only this machine."""
 
     port: setting.Port = NODE_PORT
-    """UDP port; 0 picks any free one.  If none is set and the default port is in use, for example by another node on
-    this machine, the next free one is used.  Set it on nodes that others list in ``known_nodes``."""
+    """UDP port; 0 selects any free port.  If no port is set and the default port is in use, for example by another node
+    on this machine, the next free port is used.  Set the port on nodes that other nodes list in ``known_nodes``."""
 
     known_nodes: setting.Addresses = ()
-    """Bootstrap nodes, as ``"host:port"``.  One that replies is enough; more tolerate more failures.  Empty: the node
-    finds its team on the LAN, or is the first of its network."""
+    """Bootstrap nodes, as ``"host:port"``.  One that replies is enough; with several, the node can join even when some
+    have failed.  Empty: the node finds its team on the LAN, or is the first node of its network."""
 
     lan: bool = True
     """Discover the team on the LAN by multicast, and be discovered.  False: use only ``known_nodes`` and incoming
     contacts.  No multicast is sent if ``host`` is a loopback address."""
 
     store: setting.File = IN_MEMORY
-    """File of the data store, relative to the folder of the settings file.  ``:memory:`` loses all data when the node
-    ends, so the node has a new identity at each start."""
+    """File of the data store, relative to the folder of the settings file.  ``:memory:``: no file; all data is lost
+    when the node ends, so the node has a new identity at each start."""
 
     store_rows: Annotated[int, Meta(ge=100, le=1_000_000)] = MAX_ROWS
-    """Maximum number of stored records.  More supports a larger network; each takes 1.2 KiB of memory and its value."""
+    """Maximum number of stored records.  A higher number supports a larger network; each record takes 1.2 KiB of memory
+    in addition to its value."""
 
     store_bytes: Annotated[int, Meta(ge=100_000, le=2**31)] = MAX_BYTES
-    """Maximum total size of the stored records, in bytes.  More holds more large values; less saves memory and disk.
-    Expired records and old tombstones are dropped first; then writes are refused, with figures."""
+    """Maximum total size of the stored records, in bytes.  A higher limit allows more large values; a lower one saves
+    memory and disk.  A full store drops expired records and old tombstones first; after that, it refuses writes and
+    reports its usage."""
 
     durable: Durability = "power"
-    """Durability of a write before it is acknowledged: it survives the loss of ``power``, or only a ``crash`` of the
-    node.  ``crash`` does not wait for the disk; a power failure can lose the last writes, but not damage the file."""
+    """The failure that an acknowledged write survives: a loss of ``power``, or only a ``crash`` of the node.  With
+    ``crash`` a write does not wait for the disk; a power failure can lose the last writes, but does not damage the
+    file."""
 
     membership: setting.MaybeFile = ""
-    """Membership file of a closed team, relative to the folder of the settings file, one for each node; ``swarm init``
-    creates the first one of a team, ``swarm join CODE`` a newcomer's.  Empty: the team is open, and ``team_key`` is
-    required."""
+    """Membership file of a closed team, relative to the folder of the settings file; each node needs its own.  ``swarm
+    init`` creates the first membership of a team, ``swarm join CODE`` that of a new member.  Empty: the team is open,
+    and ``team_key`` is required."""
 
     team_key: Annotated[str, Meta(min_length=1, max_length=1000), Secret()] = field(default="", repr=False)
-    """Shared secret of an open team, for a classroom, instead of a membership: any long text; it is hashed.  **Each
-    holder is a member with all permissions, and can be removed only by giving all other nodes a new key.**"""
+    """Shared secret of an open team, used instead of a membership, for example in a classroom: any long text; it is
+    hashed. **Each node with the key is a member with all permissions, and can be removed only by giving all other nodes
+    a new key.**"""
 
     roles: Annotated[tuple[str, ...], some_of(ROLES)] = ("edge",)
     """Roles of the node: ``edge`` carries a device, ``bootstrap`` admits other nodes, ``web`` serves the page."""
 
     capabilities: setting.Capabilities = field(default_factory=dict)
-    """Capabilities of the device in addition to its driver's: a table of properties (numbers or text) for each.  If the
-    driver has the same capability, the tables are merged, and these values take precedence."""
+    """Capabilities of the device in addition to those of its driver; each is a table of properties (numbers or text).
+    If the driver has the same capability, the tables are merged, and the values in this setting take precedence."""
 
     presence_lease: Annotated[float, Meta(ge=0.1, le=60.0), Unit("seconds")] = 1.0
-    """Seconds until other nodes consider a silent device lost.  Less detects a loss sooner, but mistakes a slow radio
-    for one; more sends fewer datagrams (three renewals per lease to each replica)."""
+    """Seconds until other nodes consider a silent device lost.  A shorter time detects a loss sooner, but mistakes a
+    slow radio for a loss.  A longer time needs fewer datagrams: the node sends each replica three renewals per
+    lease."""
 
     position: setting.Position = field(default_factory=dict)
     """Position of the device on the page's map: ``x`` and ``y`` in metres and ``heading`` in radians, or ``lat`` and
-    ``lon`` in degrees and ``accuracy`` in metres.  A device that measures its position reports that instead."""
+    ``lon`` in degrees and ``accuracy`` in metres.  A device that measures its position reports the measured one
+    instead."""
 
     tunnels: setting.Tunnels = ("auto",)
     """TLS tunnels to use if no known node replies by UDP, as ``"wss://host:port"``; ``auto`` means port 443 of each
-    known node on another machine.  Empty: no tunnel; the node cannot join where UDP is blocked."""
+    known node that is on a different machine.  Empty: no tunnel; the node cannot join where UDP is blocked."""
 
     tunnel_port: setting.Port = 0
-    """TCP port at which this node accepts tunnels from nodes without UDP, preferably 443; 0: none."""
+    """TCP port at which this node accepts tunnels from nodes whose UDP is blocked, preferably 443; 0: no tunnels."""
 
     tunnel_tls: bool = True
-    """False: the tunnel port does not use TLS and accepts only this machine, for a reverse proxy with a certificate."""
+    """False: the tunnel port does not use TLS and accepts only connections from this machine, for use behind a reverse
+    proxy that provides TLS."""
 
     @property
     def tunnel_urls(self) -> tuple[Url, ...]:
@@ -139,14 +146,15 @@ class DriverSettings:
     """``[driver]``: the driver of the robot."""
 
     kind: setting.Module = ""
-    """Kind of robot by name, or its driver as ``module:Class``; empty: no driver."""
+    """Name of the kind of robot, or its driver as ``module:Class``; empty: no driver."""
 
     options: setting.Options = field(default_factory=dict)
     """Options that are passed to the driver, which checks them."""
 
     parts: setting.Parts = ()
-    """Additional sensors on the robot, such as a camera board or a compass: a table ``[[driver.parts]]`` with ``kind``
-    and ``options`` for each, at most 8.  A capability of the robot itself takes precedence."""
+    """Additional sensors on the robot, such as a camera board or a compass, at most 8.  Each is a table
+    ``[[driver.parts]]`` with ``kind`` and ``options``.  If the robot and a sensor have the same capability, that of the
+    robot takes precedence."""
 
 
 @dataclass(frozen=True)
@@ -154,26 +162,29 @@ class WebSettings:
     """``[web]``: the page; used if the node has the role ``web``."""
 
     host: setting.Host = "127.0.0.1"
-    """Numeric address to listen on.  The default serves this machine only; ``0.0.0.0`` also phones and tablets."""
+    """Numeric address to listen on.  The default serves only browsers on this machine; ``0.0.0.0`` also serves phones
+    and tablets."""
 
     port: setting.Port = 8080
-    """TCP port of the page; 0 picks any free one."""
+    """TCP port of the page; 0 selects any free port."""
 
     yard: setting.MaybeAddress = None
     """Control address of the robot simulator, as ``"host:port"``; empty: none."""
 
     tls: Literal["", "auto"] = ""
-    """``auto``: also serve the page over TLS, with a certificate that the node creates (extra ``tls``; 13 MiB more).
-    Empty: no TLS; browsers then deny the page access to a phone's camera."""
+    """``auto``: also serve the page over TLS, with a certificate that the node creates; this needs the extra ``tls``
+    and 13 MiB more memory.  Empty: no TLS; browsers then deny the page access to a phone's camera."""
 
     tls_port: setting.Port = 8443
-    """TCP port of the page over TLS; 0 picks any free one."""
+    """TCP port of the page over TLS; 0 selects any free port."""
 
     code: setting.SignInCode = field(default="", repr=False)
-    """Sign-in code for operators; 6 to 40 lower-case letters, digits and ``-``.  Empty: a new one at each start."""
+    """Sign-in code for operators; 6 to 40 lower-case letters, digits and ``-``.  Empty: the node creates a new code at
+    each start."""
 
     password: Annotated[str, Meta(max_length=200), Secret()] = field(default="", repr=False)
-    """Hash of the sign-in password, as printed by ``swarm password``.  Empty: only the code can be used."""
+    """Hash of the sign-in password, as printed by ``swarm password``.  Empty: operators can sign in only with the
+    code."""
 
     names: setting.HostNames = ()
     """Additional host names by which browsers may open the page, at most 8.  The addresses of this machine, its host
@@ -188,7 +199,7 @@ class FaultSettings:
     """``[faults]``: permission for operators to inject faults into this node, for demonstrations and tests."""
 
     allow: bool = False
-    """False: fault injection is refused."""
+    """False: the node refuses fault injection."""
 
 
 @dataclass(frozen=True)
@@ -197,12 +208,12 @@ class DeploymentSettings:
 
     allow: bool = False
     """**The author of a behaviour controls the motion of this robot.**  The signature proves the author of a module,
-    not that it is harmless.  It runs in a separate process without privileges, as far as the system supports that
-    (``docs/how-to/push-code-to-a-team.md``).  False: modules are never fetched, loaded or run."""
+    not that the module is harmless.  The module runs in a separate process without privileges, as far as the operating
+    system supports this (``docs/how-to/push-code-to-a-team.md``).  False: modules are never fetched, loaded or run."""
 
     operators: setting.PublicKeys = ()
-    """Public keys of the nodes that may push modules, each 64 hexadecimal digits; in a closed team they also need the
-    role operator.  Empty: none."""
+    """Public keys of the nodes that may push modules, each 64 hexadecimal digits; in a closed team these nodes also
+    need the role operator.  Empty: no node may push modules."""
 
     modules: setting.ModuleNames = ()
     """Names of the modules that may run on this node, at most 8.  All others are refused."""
@@ -220,7 +231,7 @@ TABLES: dict[str, type[Any]] = {
 
 @dataclass(frozen=True)
 class Settings:
-    """All settings of one node; ``origin`` is the name of their file."""
+    """All settings of one node; ``origin`` is the path of the settings file."""
 
     node: NodeSettings
     agent: AgentSettings = AgentSettings()
@@ -233,7 +244,7 @@ class Settings:
     """Tables and keys that were set by the file or the command line; all others have their defaults."""
 
     def is_given(self, table: str, key: str) -> bool:
-        """Return whether that key was set."""
+        """Return whether the file or the command line set that key."""
         return (table, key) in self.given
 
     @classmethod
@@ -243,7 +254,7 @@ class Settings:
             with open(path, "rb") as file:
                 mapping = tomllib.load(file)
         except OSError as error:
-            remedy = "name a settings file that can be read"
+            remedy = "use a settings file that can be read"
             raise BadSetting(path, "", f"cannot be read: {error.strerror or error}", remedy) from error
         except UnicodeDecodeError as error:
             raise BadSetting(path, "", f"is not UTF-8 text at byte {error.start}", "save it as UTF-8") from error
@@ -255,14 +266,15 @@ class Settings:
     def from_mapping(cls, mapping: Mapping[str, object], origin: str) -> Settings:
         """Check ``mapping`` (table name to table); raises ``BadSetting``.
 
-        ``origin`` is the file name: errors name it, and relative paths are relative to its folder.
+        ``origin`` is the path of the file: it appears in errors, and relative paths in the file are relative to its
+        folder.
         """
         for name, value in mapping.items():
             if name in TABLES:
                 continue
             if isinstance(value, Mapping):
                 remedy = f"the nearest table is [{find_nearest(name, TABLES)}]"
-                raise BadSetting(origin, f"[{name}]", "is not a table of a node's settings", remedy)
+                raise BadSetting(origin, f"[{name}]", "is not a table of the node settings", remedy)
             key = find_nearest(name, [key for _, key in _keys()])
             tables = " or ".join(f"[{table}]" for table, known in _keys() if known == key)
             remedy = f"write it below {tables}" if key == name else f"the nearest setting is {key}, below {tables}"
@@ -285,9 +297,9 @@ class Settings:
     def with_flags(self, **flags: object) -> Settings:
         """Return these settings with changes from the command line.
 
-        The flag of a setting in ``[node]`` has the name of its key (``port``); in other tables it begins with the table
-        (``web_port``).  None leaves a setting unchanged.  Text is converted to the setting's type, with commas between
-        list items; a store is relative to the working directory.
+        The flag of a setting in ``[node]`` has the name of its key (``port``); in other tables the name of the table
+        comes first (``web_port``).  The value None leaves a setting unchanged.  A text value is converted to the
+        setting's type, with commas between list items.  A relative path of a store refers to the working directory.
         """
         known = {key if table == "node" else f"{table}_{key}": (table, key) for table, key in _keys()}
         changed: dict[str, dict[str, Any]] = {}

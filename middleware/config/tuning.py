@@ -1,7 +1,7 @@
 """Settings that can be changed while the node runs; changes are stored in the node's store.
 
-The device checks each change by the rules of the settings file.  The file is never written; stored changes override it
-at each start.
+The device checks each change by the same rules as the settings file.  The settings file itself is never written; at
+each start, the stored changes override its values.
 """
 
 from __future__ import annotations
@@ -25,15 +25,17 @@ from middleware.node import SwarmNode
 
 SETTINGS_METHOD, TUNE_METHOD = "device.settings", "device.tune"
 INVALID_SETTING = "setting"
-"""Code of a refusal with the text ``KEY: problem; remedy``."""
+"""Code of a refusal whose text is ``KEY: problem; remedy``."""
 NOTE_NAME = "tuning"
 
 
 @dataclass(frozen=True)
 class TunableSetting:
-    """One changeable setting: ``check`` converts a value or raises ``Invalid``; ``apply`` applies it.
+    """One setting that can be changed while the node runs.
 
-    ``least`` and ``most`` are the bounds of a number, or of the length of a text, for display.
+    ``check`` converts a value or raises ``InvalidValue``; ``apply`` applies the converted value.
+
+    ``least`` and ``most`` are the bounds of a number, or of the number of characters of a text, for display.
     """
 
     key: str
@@ -47,7 +49,7 @@ class TunableSetting:
 
 
 class Tuning:
-    """The changeable settings of one node; changes are kept in ``store``."""
+    """The changeable settings of one node; changes are written to ``store``."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
@@ -58,7 +60,7 @@ class Tuning:
         """Add a setting, and apply its stored value."""
         self._settings[setting.key] = setting
         if setting.key in self._stored:
-            with suppress(InvalidValue):  # valid when it was stored; otherwise the file's value applies
+            with suppress(InvalidValue):  # a value that is no longer valid is ignored: the file's value applies
                 setting.apply(setting.check(self._stored[setting.key]))
 
     def list_settings(self) -> list[list[object]]:
@@ -66,7 +68,7 @@ class Tuning:
         return [[k.key, k.read(), k.about, k.unit, k.least, k.most] for k in self._settings.values()]
 
     def change(self, changes: Mapping[Any, Any]) -> list[list[object]]:
-        """Apply all changes or none; raises ``Refused`` with the code ``INVALID_SETTING``."""
+        """Apply all changes or none; raise ``Refused`` with the code ``INVALID_SETTING`` if any is invalid."""
         checked = {key: self._check_change(key, value) for key, value in changes.items()}
         before = {key: self._settings[key].read() for key in checked}
         for key, value in checked.items():
@@ -101,7 +103,7 @@ class Tuning:
 
 
 def expose_tuning(node: SwarmNode, settings: Settings, body: Capabilities | None = None) -> Tuning:
-    """Expose the changeable settings of ``node``; ``body`` are the capabilities of its robot."""
+    """Expose the changeable settings of ``node``; ``body`` contains the capabilities of its robot."""
     tuning = Tuning(node.store)
 
     def check(key: str) -> Callable[[Any], Any]:

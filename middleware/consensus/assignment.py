@@ -1,4 +1,4 @@
-"""Base class and data of strategies that assign several tasks at once."""
+"""Base class and data of strategies that assign several tasks jointly."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from middleware.consensus.strategies.nearest import Nearest
 from middleware.consensus.strategy import Consensus, Report, digest_of, standing
 
 COST_SCALE = 1_000_000
-"""Costs are compared as whole millionths, so that sums are exact and equal at all nodes."""
+"""Costs are converted to whole millionths, so that their sums are exact and equal at all nodes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """A task to assign: its ``position`` in metres (may be empty), and the number of agents that act (``slots``)."""
+    """A task to assign, with its ``position`` in metres (may be empty) and the number of acting agents (``slots``)."""
 
     task: str
     position: tuple[float, ...] = ()
@@ -22,29 +22,29 @@ class Item:
 
 
 class MultiTaskStrategy(Nearest):
-    """Base class of strategies that assign several tasks; subclasses implement ``find_group``."""
+    """Base class of strategies that assign several tasks jointly; subclasses implement ``find_group``."""
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
-        """Decide the task whose id sorts first."""
+        """Decide the task with the lowest id."""
         found = self.find_group(contacts, list_items(standing(contacts)))
         return found[0] if found else super().find(contacts)
 
     def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
-        """Return all valid reports of both: each may affect the assignment."""
+        """Return all valid reports in ``a`` and ``b``, because each may affect the assignment."""
         return standing((*a, *b))
 
     def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
-        """Decide all items, sorted by task name; no agent gets more tasks than its capacity."""
+        """Return one decision for each item, sorted by task id; no agent gets more tasks than its capacity."""
         raise NotImplementedError
 
 
 def list_items(contacts: Iterable[Report]) -> list[Item]:
-    """Return the tasks that the reports name, as items without positions."""
+    """Return the tasks of the reports, as items without positions."""
     return [Item(task) for task in sorted({r.task for r in contacts if isinstance(r.task, str)})]
 
 
 def sort_items(items: Iterable[Item]) -> list[Item]:
-    """Return each item once, sorted by task name."""
+    """Return the items without duplicates, sorted by task id."""
     return sorted({item.task: item for item in items}.values(), key=lambda item: item.task)
 
 
@@ -54,7 +54,7 @@ def to_millionths(cost: float) -> int:
 
 
 def find_capacities(contacts: Iterable[Report]) -> dict[str, int]:
-    """Return the number of tasks that each agent accepts; the least if its reports differ."""
+    """Return the number of tasks that each agent accepts, the lowest in its reports."""
     most: dict[str, int] = {}
     for report in contacts:
         most[report.agent] = min(report.capacity, most.get(report.agent, report.capacity))
@@ -64,9 +64,9 @@ def find_capacities(contacts: Iterable[Report]) -> dict[str, int]:
 def build_decisions(
     name: str, counted: Sequence[Report], items: Sequence[Item], owners: Mapping[str, Sequence[str]]
 ) -> tuple[Consensus, ...]:
-    """Build the decisions of an assignment; other bidders become standbys, the cheapest first.
+    """Build the decisions of an assignment; the bidders that are not assigned become standbys, the cheapest first.
 
-    ``owners`` are the agents of each task, ``counted`` the valid reports.
+    ``owners`` are the agents assigned to each task; ``counted`` are the valid reports.
     """
     epoch = counted[0].epoch if counted else 0
     digest = digest_of(counted) if counted else ""
@@ -81,7 +81,7 @@ def build_decisions(
         standby = tuple(r.agent for r in order if r.agent not in chosen)[:15]
         reason = f"assigned with {len(items) - 1} other task{'s' * (len(items) != 2)} among {agents} agents"
         if not chosen:
-            reason = "no agent bid for it" if not order else "all bidders have reached their capacity"
+            reason = "no agent bid for the task" if not order else "all bidders have reached their capacity"
         points.append(
             Consensus(
                 chosen[0] if chosen else None, standby, digest, item.task, epoch, chosen, strategy=name, reason=reason

@@ -1,11 +1,11 @@
-"""Conformance tests that every strategy must pass, for use with your own strategy.
+"""Conformance tests that every strategy must pass; third-party strategies can use them too.
 
 ::
 
     class MineTests(Conformance, SynchronousTestCase):
         make = Mine
 
-Without a test case, ``broken(Mine)`` returns a line for each rule that the strategy breaks.
+Outside of a test case, ``broken(Mine)`` returns one line for each rule that the strategy breaks.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from middleware.consensus.strategy import READABLE, Consensus, ConsensusAlgorith
 
 Factory = Callable[[], ConsensusAlgorithm]
 TEAM_COUNT = 40
-"""Number of random teams for each rule; the same teams in every run."""
+"""Number of random teams for each rule; every run uses the same teams."""
 INVALID_CHANGES = (
     {"cost": math.nan},
     {"cost": math.inf},
@@ -53,11 +53,11 @@ _DEFAULT_REPORT = Report("", 0.0)
 
 
 class Breach(AssertionError):
-    """A strategy breaks a rule; the text names the rule and the reports."""
+    """A strategy breaks a rule; the text contains the rule and the reports."""
 
 
 class Salted(str):
-    """A name with another hash value, as in a process with another ``PYTHONHASHSEED``."""
+    """A string with a different hash value, as in a process with a different ``PYTHONHASHSEED``."""
 
     salt = 0
 
@@ -91,15 +91,15 @@ def check_name(make: Factory) -> None:
 
 
 def check_purity(make: Factory) -> None:
-    """The decision depends on the reports alone, not on earlier calls, and ``find`` does not change the reports."""
+    """The decision depends only on the reports, not on earlier calls, and ``find`` does not change the reports."""
     old = make()
     for rng, contacts in _make_teams():
         before = list(contacts)
         first = old.find(contacts)
         _require(contacts == before, "find modifies its arguments", contacts)
         old.find(make_team(rng))
-        _require(old.find(contacts) == first, "a second call of find gives another result", contacts)
-        _require(make().find(contacts) == first, "a second instance gives another result", contacts)
+        _require(old.find(contacts) == first, "a second call of find gives a different result", contacts)
+        _require(make().find(contacts) == first, "a second instance gives a different result", contacts)
 
 
 def check_order(make: Factory) -> None:
@@ -128,10 +128,10 @@ def check_merge(make: Factory) -> None:
         _require(strategy.merge(ab, ab) == ab == strategy.merge(ab, ()), "merge is not idempotent", contacts)
         _require(
             strategy.find(ab) == strategy.find([*a, *b]),
-            "find of a merged summary gives another result than find of all reports",
+            "find of a merged summary and find of all reports give different results",
             contacts,
         )
-        _require({*ab} <= {*a, *b}, "merge returns reports that were not given", contacts)
+        _require({*ab} <= {*a, *b}, "merge returns reports that are not among its arguments", contacts)
 
 
 def check_ties(make: Factory) -> None:
@@ -146,7 +146,7 @@ def check_ties(make: Factory) -> None:
 
 
 def check_winners(make: Factory) -> None:
-    """Only reporting agents are named, none twice; a single agent is assigned, and without reports none is."""
+    """Only agents that reported are in the decision, each once; a single reporting agent is assigned."""
     strategy = make()
     _require(strategy.find([]).assigned_agent is None, "an agent is assigned without any report")
     for _, contacts in _make_teams():
@@ -154,9 +154,11 @@ def check_winners(make: Factory) -> None:
         names = [name for name in (found.assigned_agent, *found.standby) if name is not None]
         _require(isinstance(found, Consensus), "find does not return a Consensus", contacts)
         _require(
-            {*names, *found.assigned} <= {r.agent for r in contacts}, "it names an agent that did not report", contacts
+            {*names, *found.assigned} <= {r.agent for r in contacts},
+            "find returns an agent that did not report",
+            contacts,
         )
-        _require(len(set(names)) == len(names), "it names an agent twice", contacts)
+        _require(len(set(names)) == len(names), "find returns an agent twice", contacts)
         alone = contacts[0]
         _require(strategy.find([alone]).assigned_agent == alone.agent, "the only agent is not assigned", [alone])
 
@@ -229,7 +231,7 @@ def check_many(make: Factory) -> None:
 
 
 def check_group(make: Factory) -> None:
-    """Several tasks at once: one decision each, no agent beyond its capacity, independent of the order."""
+    """``find_group`` returns one decision per task, exceeds no capacity, and does not depend on the order."""
     strategy: Any = make()
     if not hasattr(strategy, "find_group"):
         return
@@ -255,7 +257,7 @@ def check_group(make: Factory) -> None:
         )
         _require(
             len(assigned) == min(len(items), sum(capacity_of.values())),
-            "a task has no agent although one has capacity left",
+            "a task has no agent, although an agent has capacity left",
             bids,
         )
         mixed, turned = [*bids, *bids[:3]], items[::-1]
@@ -266,7 +268,7 @@ def check_group(make: Factory) -> None:
 
 
 def check_reads(make: Factory) -> None:
-    """A field that ``reads`` does not name is hidden in a running team, and must not affect the decision."""
+    """Fields that are not in ``reads`` do not affect the decision, because they are hidden in a running team."""
     strategy = make()
     hidden: dict[str, Any] = {
         name: getattr(_DEFAULT_REPORT, name) for name in READABLE if name not in find_read_fields(strategy)
@@ -277,7 +279,7 @@ def check_reads(make: Factory) -> None:
         same = [(f.assigned_agent, f.standby, f.value, f.choice) for f in (with_all_fields, with_visible_fields)]
         _require(
             same[0] == same[1],
-            f"it reads more fields than {', '.join(find_read_fields(strategy)) or 'the cost'}",
+            f"find reads other fields than {', '.join(find_read_fields(strategy)) or 'the cost'}",
             contacts,
         )
 
@@ -299,7 +301,7 @@ CHECKS: dict[str, Callable[[Factory], None]] = {
 
 
 def broken(make: Factory) -> dict[str, str]:
-    """Return the rules that a strategy breaks, with the reason; an exception breaks the rule."""
+    """Return the rules that a strategy breaks, each with the reason; a rule is also broken if its test raises."""
     found = {}
     for name, check in CHECKS.items():
         try:
@@ -310,7 +312,7 @@ def broken(make: Factory) -> dict[str, str]:
 
 
 class Conformance:
-    """Mixin for a test case that sets ``make`` to the class of a strategy; it adds one test for each check."""
+    """Mixin for a test case, which sets ``make`` to the class of a strategy; it adds one test for each check."""
 
     make: Any
 

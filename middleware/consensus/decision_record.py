@@ -1,9 +1,9 @@
-"""An agent's signed record of one decision; pure (``explanation`` combines the records of all agents).
+"""An agent's signed record of one decision; pure.
 
-Each participant of a task writes its decision, the strategy and the reports into its own slots under a key next to the
-task's group.  Only queries read these records; the working agents are not notified.  The record is signed by its agent,
-so no agent can write another agent's decision.  The records are team records, so they remain after their agent has
-left.
+Each participant of a task writes its decision, the strategy and the reports into its own slots, under a key that
+belongs to the task.  These records are read only to explain a decision (``middleware.diagnostics.explanation``); agents
+are not notified of them.  The record is signed by its agent, so no agent can write the decision of another agent.  It
+is a team record, so it remains after its agent has left.
 """
 
 from __future__ import annotations
@@ -24,22 +24,23 @@ from middleware.tasks.task import Member, is_choice, is_value
 
 SLOT = "verdict"
 MAX_EPOCHS = 4
-"""Number of epochs of a task that an agent keeps; a new one replaces the slot of the epoch ``MAX_EPOCHS`` before it."""
+"""Number of epochs of a task whose records an agent keeps; the record of a further epoch replaces the oldest."""
 MAX_REPORTS, MAX_BEST_REPORTS = 30, 8
-"""Of more than ``MAX_REPORTS`` reports only the ``MAX_BEST_REPORTS`` are recorded, with the total count;
-``MAX_BEST_REPORTS`` silent names at most."""
+"""If there are more than ``MAX_REPORTS`` reports, only the best ``MAX_BEST_REPORTS`` and the total number are recorded.
+At most ``MAX_BEST_REPORTS`` names of silent participants are recorded."""
 MAX_STANDBYS = 3
 MAX_RECORD_BYTES = 3300
-"""Maximum size of a record's value in bytes: three datagrams, and one for a team of ten."""
+"""Maximum size of a record's value in bytes: three datagrams; the record of a team of ten fits into one datagram."""
 MAX_NAME_BYTES, MAX_TEXT_BYTES = 40, 160
 DEFAULT_REPORT = Report("", 0.0)
 
 
 @dataclass(frozen=True)
 class RecordedReport:
-    """What one participant had reported at the time of the decision: its uuid, name and cost.
+    """The report of one participant at the time of the decision, with its uuid, name and cost.
 
-    ``more`` describes the other fields that the strategy read; "" if there were none or all had their default.
+    ``more`` describes the other fields that the strategy read; "" if it read no others, or all had their default
+    values.
     """
 
     agent: str
@@ -52,15 +53,16 @@ class RecordedReport:
 class DecisionRecord:
     """The decision of ``agent`` (a uuid) about ``task`` in ``epoch``, with its reasons.
 
-    - ``winner``, ``standby``: uuids; ``winner`` is empty if no agent qualified
+    - ``winner``, ``standby``: uuids; ``winner`` is empty if no agent was assigned
     - ``rule``, ``version``: name and version of the strategy
-    - ``hysteresis``: describes the effect on the agent that acted before
+    - ``hysteresis``: a text about the effect of the hysteresis on the agent that acted before
     - ``digest``: the digest of the reports, as this agent computed it
     - ``token``: the fencing token of the lease if this agent holds it, otherwise 0
-    - ``participants``, ``reported``: the number of participants, and of those with a report
+    - ``participants``, ``reported``: the number of participants, and the number of participants with a report
     - ``reports``: the reports, the best first
     - ``silent``: names of participants without a report
-    - ``value``, ``choice``: the agreed number or place, or the option that won the vote; empty if there is none
+    - ``value``, ``choice``: the agreed number or place, or the option that won the vote; empty if there was no such
+      result
     """
 
     agent: str
@@ -88,9 +90,9 @@ class DecisionRecord:
 
     @property
     def is_publisher(self) -> bool:
-        """Whether the agent should write its record.
+        """Whether this agent should publish its decision record.
 
-        In a group of more than ``MAX_REPORTS`` members only the agents with the best reports do.
+        In a group of more than ``MAX_REPORTS`` members only the agents with the best reports publish records.
         """
         return self.participants <= MAX_REPORTS or self.agent in [
             report.agent for report in self.reports[:MAX_BEST_REPORTS]
@@ -102,7 +104,7 @@ class DecisionRecord:
         return make_slot_name(self.epoch)
 
     def pack(self) -> bytes:
-        """Return the value of the record, at most ``MAX_RECORD_BYTES`` bytes; longer texts are cut."""
+        """Return the value of the record, at most ``MAX_RECORD_BYTES`` bytes; long strings are truncated."""
         content = {
             "name": _truncate(self.name, MAX_NAME_BYTES),
             "task": _truncate(self.task, 64),
@@ -131,7 +133,7 @@ class DecisionRecord:
             extended = bytes(msgpack.packb({**content, "more": more}))
             if len(extended) <= MAX_RECORD_BYTES:
                 return extended
-            more.pop()  # the worst reports keep only their cost
+            more.pop()  # if the record is too long, the worst reports are recorded only with their cost
         return value
 
 
@@ -141,12 +143,12 @@ def decision_records_key(task: str) -> bytes:
 
 
 def decision_records_key_text(task: str) -> str:
-    """Return the text of that key, as used in the shell."""
+    """Return the string whose hash is that key, as used in the shell."""
     return f"task/{task}/why"
 
 
 def make_slot_name(epoch: int) -> str:
-    """Return the slot of an epoch's decision record."""
+    """Return the name of the slot of an epoch's decision record."""
     return f"{SLOT}/{epoch % MAX_EPOCHS}"
 
 
@@ -163,11 +165,11 @@ def make_decision_record(
     token: int = 0,
     view: ReportView | None = None,
 ) -> DecisionRecord:
-    """Build the record of a decision that ``me`` made.
+    """Build the record of a decision of the agent ``me``.
 
-    ``consensus`` is the strategy's decision, ``assigned`` the agent selected after applying ``hysteresis`` (a share),
-    ``token`` the fencing token of the lease that this agent holds, or 0, and ``view`` the fields that the strategy
-    reads.
+    ``consensus`` is the decision of the strategy.  ``assigned`` is the agent that was assigned after ``hysteresis`` (a
+    share of the cost) was applied.  ``token`` is the fencing token of the lease that this agent holds, or 0, and
+    ``view`` is the part of a report that the strategy reads.
     """
     view = view or ReportView()
     members = {m.uuid: m for m in (*others, me)}
@@ -203,7 +205,7 @@ def make_decision_record(
 
 
 def parse_decision_record(record: Record) -> DecisionRecord | None:
-    """Return the decision in a record, or None if it is invalid or written under another agent's name; never raises."""
+    """Return the decision in a record, or None if the record is invalid; never raises."""
     content = parse_mapping(record, MAX_RECORD_BYTES)
     if content is None or not record.name.startswith(f"{SLOT}/"):
         return None
@@ -252,18 +254,18 @@ def parse_decision_record(record: Record) -> DecisionRecord | None:
 def _describe_outcome(
     members: Mapping[str, Member], acting: Member | None, found: Consensus, assigned: str | None, hysteresis: float
 ) -> str:
-    """Describe the effect on the agent that acted before; or why no agent is assigned."""
+    """Describe the effect of the hysteresis on the agent that acted before, or why no agent is assigned."""
     best = found.assigned_agent
     if not assigned:
-        return found.reason or "no report counts"
+        return found.reason or "no report is valid"
     if acting is None:
         return f"no agent acted before; {found.reason}" if found.task else "no agent acted before"
     name = members[best].name if best is not None and best in members else "no agent"
     if assigned == acting.uuid:
         if best == assigned:
             return f"{acting.name} already acts, and no agent is better"
-        return f"{name} is the best, but not better by {hysteresis:.0%} than {acting.name}, who acts"
-    return f"{name} is better by more than {hysteresis:.0%} than {acting.name}, who acted"
+        return f"{name} is the best, but not more than {hysteresis:.0%} better than {acting.name}, which acts"
+    return f"{name} is more than {hysteresis:.0%} better than {acting.name}, which acted before"
 
 
 def _as_tuple(uuid: str | None) -> tuple[str, ...]:
@@ -271,7 +273,7 @@ def _as_tuple(uuid: str | None) -> tuple[str, ...]:
 
 
 def _truncate(text: str, most: int) -> str:
-    """Cut a text to ``most`` bytes and replace unprintable characters: other members chose the text."""
+    """Truncate a string from another member to ``most`` bytes, and replace its unprintable characters."""
     printable = "".join(c if c.isprintable() else "?" for c in text)
     return printable.encode(errors="replace")[:most].decode(errors="ignore")
 

@@ -1,6 +1,6 @@
-"""The names by which tasks refer to deployed modules, and the lookup of their factories; pure.
+"""The names with which tasks refer to deployed modules, and the lookup of the modules' factories; pure.
 
-Every node resolves such names, including nodes that allow no deployment and do not import ``middleware.deployment``.
+Nodes that do not allow deployment also have to resolve these names, without importing ``middleware.deployment``.
 """
 
 from __future__ import annotations
@@ -23,19 +23,20 @@ DeployedModules = Mapping[tuple[str, str], Factory]
 
 
 def is_deployed(name: str) -> bool:
-    """Return whether a task's strategy or kind is a deployed module."""
+    """Return whether ``name``, a task's strategy or kind, refers to a deployed module."""
     return name.startswith(PREFIX)
 
 
 def find_factory(kind: str, name: str, deployed: DeployedModules) -> Factory:
     """Return the factory of the deployed module ``name`` of this ``kind``.
 
-    Raises ``UnknownStrategy`` or ``UnknownTask``, depending on the kind; the text lists the known names.
+    Raises ``UnknownStrategy`` or ``UnknownTask``, depending on ``kind``; the text of the exception lists the known
+    names.
     """
     make = deployed.get((kind, name.removeprefix(PREFIX)))
     if make is None:
         known = ", ".join(sorted(f"{PREFIX}{each}" for other, each in deployed if other == kind)) or "none"
         raise ERRORS_BY_KIND[kind](
-            f"{kind} {name!r} is not deployed on this node (see [deployment] in its settings); deployed: {known}"
+            f"{kind} {name!r} is not deployed on this node (see [deployment] in the node's settings); deployed: {known}"
         )
     return make

@@ -1,7 +1,8 @@
 """Protect agents against faulty strategies.
 
-A strategy that raises, times out or returns an invalid result is replaced by ``nearest`` for that decision, and the
-reason says so.  Safety does not depend on this, because it rests on leases; the guard keeps the team working.
+If a strategy raises an exception, times out or returns an invalid result, ``nearest`` makes that decision instead, and
+the reason of the decision describes the failure.  Safety does not depend on the guard, because only a lease gives the
+right to act; the guard lets the team continue its work.
 """
 
 from __future__ import annotations
@@ -28,26 +29,28 @@ from middleware.errors import SwarmError
 
 MAX_REMEMBERED_RESULTS = 64
 MAX_LOSSES = 3
-"""A strategy that is lost this many times within ``LOSS_SPAN_CALLS`` calls is not called again.
+"""Number of losses (``StrategyLost``) within ``LOSS_SPAN_CALLS`` calls after which a strategy is not called again.
 
-Each loss costs a full deadline.
+Each loss blocks the node for the full deadline of a call.
 """
 LOSS_SPAN_CALLS = 10_000
-"""Calls after which a loss is forgotten, about four minutes of a task: a busy machine is late now and then."""
+"""Number of calls after which a loss is forgotten, about four minutes of a task.  On a busy machine, calls are
+sometimes late."""
 
 
 class StrategyError(SwarmError):
-    """A strategy's result is unusable; the text is the reason."""
+    """The result of a strategy is unusable; the text is the reason."""
 
 
 class StrategyLost(StrategyError):
-    """A strategy gave no result and its process was ended: it was late, sent too much, or died."""
+    """A strategy gave no result: it was late, sent too much data, or its process ended."""
 
 
 class GuardedStrategy:
-    """Call a strategy and fall back to ``nearest`` if it fails.
+    """Calls a strategy, and uses ``nearest`` instead if the strategy fails.
 
-    With ``twice``, ``find`` is called a second time with the reports in another order, for third-party strategies.
+    If ``twice``, which is for third-party strategies, ``find`` is called again with the reports in a different order,
+    and both results must be equal.
     """
 
     log = Logger()
@@ -65,7 +68,7 @@ class GuardedStrategy:
         self._results: OrderedDict[tuple[Report, ...], Consensus] = OrderedDict()
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
-        """Decide from the valid reports; the reason says if the fallback decided."""
+        """Return the decision for the valid reports; if the fallback made it, its reason describes the failure."""
         valid = _valid_reports(contacts)
         try:
             self._check_losses()
@@ -74,20 +77,20 @@ class GuardedStrategy:
             if known != found or (
                 self._is_called_twice and check_consensus(self.strategy.find(valid[::-1]), valid) != found
             ):
-                raise StrategyError("it gives two results for equal reports")
+                raise StrategyError("find returns different results for equal reports")
             while len(self._results) > MAX_REMEMBERED_RESULTS:
                 self._results.popitem(last=False)
         except Exception as error:  # third-party code may raise anything
             why = self._record_failure(error)
             fallback = self._fallback.find(valid)
-            reason = f"{self.name} has no opinion ({why}); {self._fallback.name}: {fallback.reason}"
+            reason = f"{self.name} failed ({why}); {self._fallback.name}: {fallback.reason}"
             return replace(fallback, strategy=self._fallback.name, reason=reason)
         return replace(found, strategy=self.name)
 
     def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
-        """Decide all items.
+        """Return one decision for each item.
 
-        A strategy without ``find_group``, and the fallback, decide the items one after another.
+        If the strategy has no ``find_group``, or fails, the items are decided one after another.
         """
         valid = _valid_reports(contacts)
         find_group = getattr(self.strategy, "find_group", None)
@@ -99,13 +102,13 @@ class GuardedStrategy:
         except NotImplementedError:
             return decide_one_by_one(self.find, valid, items)
         except Exception as error:  # third-party code may raise anything
-            reason = f"{self.name} has no opinion ({self._record_failure(error)}); {self._fallback.name}: "
+            reason = f"{self.name} failed ({self._record_failure(error)}); {self._fallback.name}: "
             found = decide_one_by_one(self._fallback.find, valid, items)
             return tuple(replace(p, strategy=self._fallback.name, reason=reason + p.reason) for p in found)
         return tuple(replace(point, strategy=self.name) for point in found)
 
     def improves(self, current: Report, offer: Report, hysteresis: float) -> bool:
-        """Return whether ``offer`` should take over; the fallback decides if the strategy fails."""
+        """Return whether the agent of ``offer`` should take over; if the strategy fails, the fallback decides."""
         if refusal(offer):
             return False
         try:
@@ -119,13 +122,13 @@ class GuardedStrategy:
         return answer
 
     def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
-        """Return a summary of the valid reports of both; the fallback's if the strategy returns other reports."""
+        """Return a summary of the valid reports in ``a`` and ``b``; if the strategy fails, that of the fallback."""
         valid = _valid_reports((*a, *b))
         try:
             self._check_losses()
             merged = self.strategy.merge(valid, ())
             if not isinstance(merged, tuple) or len(merged) > len(valid) or not set(merged) <= set(valid):
-                raise StrategyError("merge returns reports that were not given")
+                raise StrategyError("merge returned reports that are not among its arguments")
         except Exception as error:  # third-party code may raise anything
             self._record_failure(error)
             return self._fallback.merge(valid, ())
@@ -139,19 +142,19 @@ class GuardedStrategy:
 
     def _check_losses(self) -> None:
         if len(self._losses) >= MAX_LOSSES:
-            raise StrategyError(f"it gave no result {MAX_LOSSES} times and is not called again")
+            raise StrategyError(f"the strategy gave no result {MAX_LOSSES} times and is not called again")
         self._calls += 1
 
     def _record_failure(self, error: Exception) -> str:
-        """Count and log a failure, and return it in one line; the same failure is not logged again."""
+        """Log a failure, and return it as one line; the same failure is not logged again."""
         if isinstance(error, StrategyLost):
             self._losses = [*(each for each in self._losses if self._calls - each < LOSS_SPAN_CALLS), self._calls]
         text = str(error) if isinstance(error, StrategyError) else f"{type(error).__name__}: {error}"
-        # the last line of a trace is the exception
+        # the last line of a traceback is the exception
         why = (text.strip().splitlines() or ["no error text"])[-1][:MAX_NAME]
         if why != self.failure_reason:
             self.failure_reason = why
-            self.log.failure("strategy {name} has no opinion: {why}", name=self.name, why=why)
+            self.log.failure("strategy {name} failed; nearest is used instead: {why}", name=self.name, why=why)
         return why
 
 
@@ -163,22 +166,22 @@ def check_consensus(found: Consensus, contacts: Sequence[Report]) -> Consensus:
     named = () if found.assigned_agent is None else (found.assigned_agent,)
     for group in (found.standby, found.assigned, found.value):
         if not isinstance(group, tuple) or len(group) > max(8, len(agents)):
-            raise StrategyError("it names more agents or numbers than allowed")
+            raise StrategyError("find returns too many agents or numbers")
     for agent in (*named, *found.standby, *found.assigned):
         if agent not in agents:
-            raise StrategyError(f"it names {agent!r:.60}, which did not report")
+            raise StrategyError(f"find returns the agent {agent!r:.60}, which did not report")
     if len({*named, *found.standby}) < len(named) + len(found.standby):
-        raise StrategyError("it names an agent twice")
+        raise StrategyError("find returns an agent twice")
     for text in (found.digest, found.task, found.choice, found.strategy, found.reason):
         if not isinstance(text, str) or len(text) > 2 * MAX_NAME:
-            raise StrategyError("a text of its result is too long")
+            raise StrategyError("a string in the result of find is too long")
     if not all(type(n) in (int, float) and -MAX_NUMBER <= n <= MAX_NUMBER for n in found.value):
-        raise StrategyError("its value is not a tuple of valid numbers")
+        raise StrategyError("the value in the result of find is not a tuple of valid numbers")
     return found
 
 
 def check_group(found: Sequence[Consensus], contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
-    """Return ``found`` if it has one possible decision per item within all capacities; else raise ``StrategyError``."""
+    """Return ``found`` if it is a possible decision per item, within all capacities; else raise ``StrategyError``."""
     if not isinstance(found, tuple) or not all(isinstance(point, Consensus) for point in found):
         raise StrategyError("find_group does not return a tuple of Consensus")
     if [point.task for point in found] != [item.task for item in sort_items(items)]:
@@ -190,14 +193,14 @@ def check_group(found: Sequence[Consensus], contacts: Sequence[Report], items: S
         for agent in {*point.assigned, *filter(None, (point.assigned_agent,))}:
             capacity_left[agent] = capacity_left.get(agent, 0) - 1
     if overloaded := sorted(agent for agent, remaining in capacity_left.items() if remaining < 0):
-        raise StrategyError(f"it gives {overloaded[0]!r:.60} more tasks than its capacity")
+        raise StrategyError(f"find_group assigns to {overloaded[0]!r:.60} more tasks than its capacity")
     return found
 
 
 def decide_one_by_one(
     find: Callable[[Sequence[Report]], Consensus], contacts: Sequence[Report], items: Sequence[Item]
 ) -> tuple[Consensus, ...]:
-    """Decide the items separately, sorted by task name; agents whose capacity is used up are left out."""
+    """Decide the items one after another, sorted by task id; skip agents whose capacity is used up."""
     counted = standing(contacts)
     capacity_left = find_capacities(counted)
     points = []
@@ -211,7 +214,7 @@ def decide_one_by_one(
 
 
 def _valid_reports(contacts: Sequence[Report]) -> tuple[Report, ...]:
-    """Return the valid reports in an order that does not depend on the given one."""
+    """Return the valid reports in a defined order."""
     return tuple(sorted((r for r in contacts if not refusal(r)), key=_sort_key))
 
 

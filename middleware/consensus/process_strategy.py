@@ -1,7 +1,7 @@
 """Run a third-party strategy in a separate process, so that a call that does not return can be stopped.
 
-Code that never returns cannot be stopped safely within its own process.  This protects against mistakes, not against
-malice: settings decide which code may be loaded.
+Code that never returns cannot be stopped safely within its own process.  The separate process protects against
+mistakes, not against malicious code; the settings determine which code may be loaded.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from middleware.consensus.guarded_strategy import StrategyError, StrategyLost
 from middleware.consensus.remote_strategy import RemoteStrategy
 
 DEADLINE_S = 0.2
-"""Maximum seconds that one call blocks the node; well below a third of a lease's duration."""
+"""Maximum seconds for which one call blocks the node; well below a third of the duration of a lease."""
 START_TIMEOUT_S = 5.0
 MAX_RESULT_BYTES = 65_536
 LENGTH_PREFIX = struct.Struct("!I")
 
 
 class ProcessStrategy(RemoteStrategy):
-    """The strategy at ``import_path`` (``module:Class``), called through pipes; methods raise the strategy's error.
+    """The strategy at ``import_path`` (``module:Class``), called through pipes; its errors are raised here.
 
-    ``deadline`` is the maximum time of a call in seconds; ``path`` precedes this process's import path.
+    ``deadline`` is the maximum duration of a call in seconds; ``path`` is searched before this process's import path.
     """
 
     version = ""
@@ -81,12 +81,12 @@ class ProcessStrategy(RemoteStrategy):
             process.wait()
 
     def call(self, method: str, arguments: list[Any]) -> Any:
-        """Call ``method`` in the process and return its result; raises ``StrategyError``."""
+        """Call ``method`` in the process and return its result; raise ``StrategyError``."""
         end = time.monotonic() + self._deadline
         if self._load_error:
             raise StrategyRaised(self._load_error)
         if self._is_stopped:
-            raise StrategyError("it was stopped")
+            raise StrategyError("the strategy was stopped")
         if self._process is None:
             self._start()
         try:
@@ -97,23 +97,23 @@ class ProcessStrategy(RemoteStrategy):
             return self._unpack(self._read(end))
         except TimeoutError:
             if not self._is_ready and time.monotonic() - self._started_at < START_TIMEOUT_S:
-                raise StrategyError("it is still loading") from None
+                raise StrategyError("the strategy is still loading") from None
             self._end()
-            raise StrategyLost(f"it gave no result within {self._deadline:g} s") from None
+            raise StrategyLost(f"no result within {self._deadline:g} s") from None
         except (OSError, ValueError, StrategyError) as error:
             if not self._is_ready and isinstance(error, StrategyRaised):
                 self._load_error = str(error)
             if not self._is_ready or not isinstance(error, StrategyRaised):
                 self._end()
             if isinstance(error, OSError):
-                raise StrategyLost("its process has died") from error
+                raise StrategyLost("the process of the strategy has ended") from error
             raise
 
     def _unpack(self, answer: bytes) -> Any:
         try:
             is_ok, content = msgpack.unpackb(answer)
-        except Exception as error:  # msgpack raises many things
-            raise StrategyLost("its result cannot be decoded") from error
+        except Exception as error:  # msgpack raises many types of exceptions
+            raise StrategyLost("the result of the strategy cannot be decoded") from error
         if not is_ok:
             raise StrategyRaised(str(content))
         return content
@@ -130,7 +130,7 @@ class ProcessStrategy(RemoteStrategy):
     def _read(self, end: float) -> bytes:
         (size,) = LENGTH_PREFIX.unpack(self._read_bytes(LENGTH_PREFIX.size, end))
         if size > MAX_RESULT_BYTES:
-            raise StrategyLost(f"its result has {size} bytes, more than {MAX_RESULT_BYTES}")
+            raise StrategyLost(f"the result of the strategy has {size} bytes; at most {MAX_RESULT_BYTES} are allowed")
         return self._read_bytes(size, end)
 
     def _read_bytes(self, size: int, end: float) -> bytes:
@@ -140,13 +140,13 @@ class ProcessStrategy(RemoteStrategy):
             _wait(self._process.stdout.fileno(), select.POLLIN, end)
             more = os.read(self._process.stdout.fileno(), size - len(found))
             if not more:
-                raise StrategyLost("its process has died")
+                raise StrategyLost("the process of the strategy has ended")
             found += more
         return found
 
 
 class StrategyRaised(StrategyError):
-    """The strategy raised an exception; the text is its trace."""
+    """The strategy raised an exception; the text is the traceback."""
 
 
 def _wait(pipe: int, event: int, end: float) -> None:

@@ -12,20 +12,20 @@ from middleware.consensus.strategy import Consensus, Report
 
 
 class RemoteStrategy:
-    """A strategy in another process; each method raises the error of that process."""
+    """A strategy in another process; each method raises ``StrategyError`` if the call fails there."""
 
     def call(self, method: str, arguments: list[Any]) -> Any:
         """Call ``method`` in the other process and return its result as plain values."""
         raise NotImplementedError
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
-        """Decide, in the other process."""
+        """Return the decision, made in the other process."""
         return _consensus_from(self.call("find", [astuple(r) for r in contacts]))
 
     def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
-        """Decide all items, in the other process.
+        """Return the decisions for all items, made in the other process.
 
-        Raises ``NotImplementedError`` if the strategy decides single tasks only.
+        Raises ``NotImplementedError`` if the strategy can only decide single tasks.
         """
         answer = self.call("find_group", [[astuple(r) for r in contacts], [astuple(i) for i in items]])
         if answer is None:
@@ -64,7 +64,7 @@ def run_call(strategy: Any, method: str, arguments: list[Any]) -> Any:
 
 
 def make_report(fields: Sequence[Any]) -> Report:
-    """Rebuild a report from the plain values of ``astuple``."""
+    """Create a report from its values as returned by ``astuple``."""
     return Report(*_tuples_from_lists(fields))
 
 
@@ -72,7 +72,7 @@ def _consensus_from(plain: Any) -> Consensus:
     try:
         return Consensus(*_tuples_from_lists(plain))
     except TypeError as error:
-        raise StrategyError(f"it returns {plain!r:.60}, not Consensus") from error
+        raise StrategyError(f"find returns {plain!r:.60}, not Consensus") from error
 
 
 def _tuples_from_lists(values: Sequence[Any]) -> list[Any]:

@@ -1,13 +1,13 @@
-"""The part of the members' reports that a strategy sees; pure.
+"""The part of the members' reports that a strategy gets; pure.
 
-Records under the task's key and bids to the quorum members carry the same reports, and both pass through here: the
-decision does not depend on the path.  Fields that the strategy does not read are hidden from it and are not part of the
-digest.
+Reports arrive in records under the task's key and in bids.  Both pass through this module, so the decision does not
+depend on the way in which a report arrives.  Fields that the strategy does not read are hidden from it and are not part
+of the digest.
 
-The age of a report is never shown, because each member would see another age; stale reports are removed earlier
-(``agents.decider``).  Reports of older rounds, and all but the newest of each member, are removed too: ``epoch`` and
-``sequence`` of a report stay 0.  A device that does not meet the task's requirements takes no part: ``unmet`` stays
-empty.  A device does one task at a time: ``capacity`` stays 1.
+Some fields of a report always have their default value here.  ``age`` is hidden, because it would be different at each
+member; stale reports are removed earlier (``agents.decider``).  ``epoch`` and ``sequence`` are 0, because only the
+newest report of each member in the current round is used.  ``unmet`` is empty, because a device that does not meet the
+task's requirements does not participate.  ``capacity`` is 1, because a device does one task at a time.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from middleware.tasks.task import Member, is_bid, is_choice, is_value
 
 
 class ReportView:
-    """The view of a strategy that reads ``reads`` (names out of ``strategy.READABLE``) besides the cost."""
+    """The view of a strategy that reads the fields ``reads`` (of ``strategy.READABLE``) in addition to the cost."""
 
     def __init__(self, reads: Iterable[str] = ()) -> None:
         self.reads = tuple(name for name in READABLE if name in tuple(reads))
 
     def make_report(self, member: Member) -> Report | None:
-        """Return the report that the strategy sees of ``member``; None if the member has reported no valid cost."""
+        """Return the report of ``member`` for the strategy; None if the member has not reported a valid cost."""
         if member.cost is None or not is_bid(member.cost):
             return None
         return Report(member.uuid, member.cost, **{name: _READERS[name](member) for name in self.reads})
@@ -47,10 +47,10 @@ def make_view(strategy: object) -> ReportView:
     return ReportView(find_read_fields(strategy))
 
 
-# Numbers are converted to one type: 1 and 1.0 are equal but have different digests.
+# Numbers are converted to float, because 1 and 1.0 are equal but have different digests.
 _READERS: dict[str, Any] = {
     "battery": lambda member: float(member.battery),
-    "load": lambda member: float(max(0, member.load - 1)),  # tasks besides this one
+    "load": lambda member: float(max(0, member.load - 1)),  # the number of tasks in addition to this one
     "value": lambda member: tuple(map(float, member.value)),
     "choice": lambda member: member.choice,
     "weight": lambda member: float(member.weight),

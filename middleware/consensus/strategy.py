@@ -1,4 +1,4 @@
-"""The interface of strategies: pure functions, loaded by name, from reports to the agent that should act.
+"""The interface of strategies: pure functions from reports to the agent that should act, loaded by name.
 
 A strategy sees the reports of the agents that take part in a task and selects the agent that should act (thesis,
 section 4.2.5 and Algorithm 4.5: ``consensus.find(contacts)``, ``consensus.assigned_agent``). A wrong strategy makes a
@@ -30,7 +30,7 @@ BUILT_IN = {
 }
 ENTRY_POINT_GROUP = "swarm_node.strategies"
 MAX_NUMBER = 1e9
-"""Upper bound of costs, weights and coordinates; such numbers add up without loss of precision."""
+"""Upper bound of costs, weights and coordinates; sums of numbers below this bound do not lose precision."""
 MAX_WHOLE = 2**53
 MAX_NAME = 200
 READABLE = ("battery", "load", "value", "choice", "weight", "electorate")
@@ -48,18 +48,19 @@ class Report:
     - ``cost``: the cost of acting, at least 0, in the strategy's unit (``nearest``: metres; ``capability_cost``:
       seconds)
     - ``task``: the task's id
-    - ``epoch``: the round of the decision; only reports of the newest epoch count
+    - ``epoch``: the round of the decision; only reports of the newest epoch are used
     - ``sequence``: the number of this report or vote; a higher one replaces a lower one of the same agent
-    - ``value``: a number or a place in metres (``average``, ``rendezvous``); the agent's position for ``sequential``
+    - ``value``: a number or a position in metres (``average``, ``rendezvous``), or the agent's position
+      (``sequential``)
     - ``choice``: the option that the agent votes for; "" if it has not voted
     - ``weight``: the weight of ``value`` and ``choice``
     - ``electorate``: the total weight of all agents that may vote
     - ``capacity``: the number of tasks that the agent accepts
-    - ``battery``: the charge that is left, 0 to 1
+    - ``battery``: the remaining charge, 0 to 1
     - ``load``: the number of tasks that the agent already has
     - ``unmet``: the requirements of the task that the device does not meet
     - ``age``: seconds since the measurement.  Ages are durations because the clocks of two nodes differ.
-    - ``valid_for``: seconds for which the report is valid; 0: while the agent is present
+    - ``valid_for``: seconds for which the report is valid; 0: as long as the agent is present
     """
 
     agent: str
@@ -88,8 +89,8 @@ class Consensus:
     - ``digest``: the digest of the reports that were used (``digest_of``)
     - ``task``, ``epoch``: the task and the round that were decided
     - ``assigned``: all agents that act, if the task has several slots
-    - ``value``: the agreed number or place; ``choice``: the option that won the vote
-    - ``strategy``, ``reason``: text for display; ignored in comparisons
+    - ``value``: the agreed number or position; ``choice``: the option that won the vote
+    - ``strategy``, ``reason``: texts for display, which are ignored in comparisons
     """
 
     assigned_agent: str | None
@@ -107,38 +108,42 @@ class Consensus:
 class ConsensusAlgorithm(Protocol):
     """The interface of a strategy.  Each method is a pure function: equal reports in any order give an equal result.
 
-    Invalid reports (``refusal``) must not affect any result; ``standing`` removes them.  Ties must be broken equally at
-    every node, for example by uuid.  ``middleware.consensus.conformance`` tests an implementation against all rules.
+    Invalid reports (``refusal``) must not affect any result; ``standing`` removes them.  Every node must break ties in
+    the same way, for example by uuid.  ``middleware.consensus.conformance`` tests an implementation against all rules.
 
-    A strategy may also have an attribute ``reads``, the names out of ``READABLE`` of the fields that it uses besides
-    the cost, and a method ``find_group`` to decide several tasks at once (``middleware.consensus.assignment``).
+    A strategy may also have an attribute ``reads``: the fields that it uses besides the cost, which must be in
+    ``READABLE``.  It may also have a method ``find_group``, which assigns several tasks jointly
+    (``middleware.consensus.assignment``).
     """
 
     name: str
     version: str
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
-        """Decide from the reports of all agents, including the caller's; without reports, assign no agent."""
+        """Return the decision for the reports of all agents, including the caller.
+
+        If there is no report, no agent is assigned.
+        """
 
     def improves(self, current: Report, offer: Report, hysteresis: float) -> bool:
         """Return whether ``offer`` is better than ``current`` by more than ``hysteresis``.
 
         ``hysteresis`` is a share of the cost (0.1: 10 %).
-        ``current`` is the report of the agent that acts now; if True, the task is reassigned to the agent of ``offer``.
-        An equal or invalid offer is never better.
+        ``current`` is the report of the agent that acts now.  If the result is True, the task is reassigned to the
+        agent of ``offer``.  An equal or invalid offer is never better.
         """
 
     def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
-        """Return a summary of both sets of reports that leads ``find`` to the same decision as all reports.
+        """Return a summary of both sets of reports, for which ``find`` makes the same decision as for all reports.
 
         The operation is a join: commutative, associative and idempotent.
         """
 
 
 def refusal(report: Report) -> str:
-    """Return the reason why a report is invalid and is ignored, or "" if it is valid."""
+    """Return the reason why a report is invalid and therefore ignored, or "" if it is valid."""
     if not isinstance(report.agent, str) or not 0 < len(report.agent) <= MAX_NAME:
-        return f"agent must be a text of 1 to {MAX_NAME} characters"
+        return f"agent must be a string of 1 to {MAX_NAME} characters"
     numbers = (report.cost, report.weight, report.electorate, report.load, report.age, report.valid_for)
     if not all((type(n) is float or type(n) is int) and 0.0 <= n <= MAX_NUMBER for n in numbers):
         for label, number in zip(LABELS, numbers, strict=True):
@@ -156,7 +161,7 @@ def refusal(report: Report) -> str:
             return f"epoch, sequence or capacity {_format_number(whole)} is not a whole number from 0 to 2^53 - 1"
     for text in (report.task, report.choice):
         if not isinstance(text, str) or len(text) > MAX_NAME:
-            return f"task and choice must be texts of at most {MAX_NAME} characters"
+            return f"task and choice must be strings of at most {MAX_NAME} characters"
     if report.unmet:
         return "requirements not met: " + ", ".join(map(str, report.unmet))[:MAX_NAME]
     if 0.0 < report.valid_for < report.age:
@@ -172,8 +177,8 @@ def get_cost(report: Report) -> float:
 def standing(contacts: Iterable[Report], rank: Callable[[Report], float] = get_cost) -> tuple[Report, ...]:
     """Return the valid reports of the newest epoch, one per task and agent, sorted by task and agent.
 
-    Of several reports of one agent the one with the lowest ``rank`` counts. The operation is a join: order, grouping
-    and repetition of the reports make no difference.
+    If an agent has several reports for a task, the report with the lowest ``rank`` is used. The operation is a join:
+    order, grouping and repetition of the reports make no difference.
     """
     valid = [r for r in contacts if not refusal(r)]
     epoch = max((r.epoch for r in valid), default=0)
@@ -196,8 +201,8 @@ def build_consensus(
 ) -> Consensus:
     """Build the decision of the strategy ``name``: the first agent of ``order`` acts, the others are standbys.
 
-    If ``order`` is empty, no agent is assigned.  ``counted`` are the reports that were used, at least one, all of one
-    task and epoch.
+    If ``order`` is empty, no agent is assigned.  ``counted`` are the reports that were used: at least one, all with the
+    same task and epoch.
     """
     agents = tuple(r.agent for r in order)
     return Consensus(
@@ -227,7 +232,7 @@ def find_read_fields(strategy: object) -> tuple[str, ...]:
 
 
 def format_agreement(value: tuple[float, ...], choice: str) -> str:
-    """Format the agreed number, place or option for display; "" if there is none."""
+    """Format the agreed number, position or option for display; "" if nothing was agreed."""
     if choice:
         return choice[:MAX_SHOWN_CHARACTERS]
     if len(value) == 1:
@@ -236,17 +241,17 @@ def format_agreement(value: tuple[float, ...], choice: str) -> str:
 
 
 def digest_of(contacts: Iterable[Report]) -> str:
-    """Return a digest of eight hexadecimal digits that is equal for equal reports in any order."""
-    texts = sorted(f"{r.agent}={r.cost + 0.0:.6f};{_optional_fields(r)}" for r in contacts)  # -0.0 is 0.0
+    """Return a digest of eight hexadecimal digits, which does not depend on the order of the reports."""
+    texts = sorted(f"{r.agent}={r.cost + 0.0:.6f};{_optional_fields(r)}" for r in contacts)  # -0.0 + 0.0 is 0.0
     return hashlib.blake2s("".join(texts).encode(errors="replace"), digest_size=4).hexdigest()
 
 
 def load_strategy(name: str, dotted: bool = False, deployed: DeployedModules | None = None) -> ConsensusAlgorithm:
-    """Load the strategy called ``name``: a built-in one, or an entry point of the group ``swarm_node.strategies``.
+    """Load the strategy ``name``: a built-in one, or an entry point of the group ``swarm_node.strategies``.
 
-    ``deployed:x`` is the module ``x`` in ``deployed``, which an operator deployed to the team. With ``dotted``,
-    ``name`` may also be ``module:Class``.  Use this for names in local settings only: a peer must not choose what this
-    machine imports. Raises ``UnknownStrategy``; its text lists the known names.
+    The name ``deployed:x`` refers to the module ``x`` in ``deployed``, which an operator has deployed to the team. If
+    ``dotted``, ``name`` may also be ``module:Class``.  Set this only for names in local settings, because a peer must
+    not choose which modules this machine imports.  Raises ``UnknownStrategy``, whose text lists the known names.
     """
     if is_deployed(name):
         return _create_deployed(name, deployed or {})
@@ -273,7 +278,7 @@ def find_import_path(name: str, dotted: bool = False) -> str:
 
 def _range_error(number: float, lowest: float = 0.0) -> str:
     if type(number) is not float and type(number) is not int:
-        return "has the wrong type, not a number"
+        return "must be a number"
     if lowest <= number <= MAX_NUMBER:
         return ""
     if number != number:

@@ -1,4 +1,4 @@
-"""Select the strategy of a task and the process in which it runs."""
+"""Load the strategy of a task, and select the process in which it runs."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from middleware.errors import UnknownStrategy
 class StrategyRegistry:
     """The strategies of one node, by name.
 
-    A third-party strategy runs in a process, so one instance is shared by all tasks and auctions until ``stop``.  Its
-    losses (``guarded_strategy.MAX_LOSSES``) therefore count across tasks: each loss blocks the whole node.  A strategy
-    that reached the limit is not called again until the node restarts.
+    A third-party strategy runs in a separate process, so all tasks and auctions share one instance until ``stop``.  Its
+    losses (``guarded_strategy.MAX_LOSSES``) are therefore counted over all tasks, because each loss blocks the whole
+    node.  A strategy that has reached the limit is not called again until the node restarts.
     """
 
     def __init__(self) -> None:
@@ -21,7 +21,7 @@ class StrategyRegistry:
         self._is_stopped = False
 
     def get(self, name: str, deployed: DeployedModules) -> GuardedStrategy:
-        """Return the guarded strategy of that name; the newest one if it is in ``deployed``.
+        """Return the guarded strategy with that name; for a deployed strategy, its newest version.
 
         Raises ``UnknownStrategy`` for an unknown name, and for a third-party strategy after ``stop``.
         """
@@ -36,17 +36,17 @@ class StrategyRegistry:
         return self._third_party[name]
 
     def stop(self) -> None:
-        """Stop the processes of third-party strategies; later calls get the fallback's result."""
+        """Stop the processes of third-party strategies; later calls return the result of the fallback."""
         self._is_stopped = True
         for strategy in self._third_party.values():
             strategy.stop()
 
 
 def load_guarded_strategy(name: str, dotted: bool = False, deployed: DeployedModules | None = None) -> GuardedStrategy:
-    """Load and guard a strategy: built-in ones run in this process, all others in their own process with a deadline.
+    """Load and guard a strategy: a built-in one runs in this process, any other in a separate process with a deadline.
 
-    A deployed strategy already has a process (``middleware.deployment``), and is called twice.  The caller stops any
-    other strategy with a process.  Raises ``UnknownStrategy``.
+    A deployed strategy already has a process (``middleware.deployment``).  The caller has to stop any other strategy
+    that has a process.  Raises ``UnknownStrategy``.
     """
     if _is_run_in_process(name, dotted):
         return GuardedStrategy(load_strategy(name, dotted, deployed), twice=is_deployed(name))
@@ -56,5 +56,5 @@ def load_guarded_strategy(name: str, dotted: bool = False, deployed: DeployedMod
 
 
 def _is_run_in_process(name: str, dotted: bool = False) -> bool:
-    """Return whether a strategy needs no new process; raises ``UnknownStrategy``."""
+    """Return whether a strategy can be loaded without a new process; raise ``UnknownStrategy``."""
     return is_deployed(name) or find_import_path(name, dotted) in BUILT_IN.values()

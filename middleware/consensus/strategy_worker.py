@@ -1,4 +1,4 @@
-"""The process in which a third-party strategy runs: the other end of ``process_strategy``."""
+"""Main program of the process in which ``process_strategy`` runs a third-party strategy."""
 
 from __future__ import annotations
 
@@ -23,8 +23,10 @@ MAX_TRACE_CHARACTERS = 4000
 def _send(out: BinaryIO, is_ok: bool, content: Any) -> None:
     try:
         packed = bytes(msgpack.packb([is_ok, content]))
-    except Exception as error:  # the result is not serialisable
-        packed = bytes(msgpack.packb([False, f"its result is not a plain value: {error}"[:MAX_TRACE_CHARACTERS]]))
+    except Exception as error:  # not serialisable
+        packed = bytes(
+            msgpack.packb([False, f"the result of the strategy is not a plain value: {error}"[:MAX_TRACE_CHARACTERS]])
+        )
     out.write(LENGTH_PREFIX.pack(len(packed)) + packed)
     out.flush()
 
@@ -34,9 +36,11 @@ def main() -> None:
     import_path, limit_s = sys.argv[1], float(sys.argv[2])
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
     out = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # output of the strategy itself must not mix with results
+    os.dup2(2, 1)  # keep the output of the strategy apart from results
     pipe = sys.stdin.buffer
-    signal.signal(signal.SIGALRM, signal.SIG_DFL)  # the default action ends the process even if its parent is dead
+    signal.signal(
+        signal.SIGALRM, signal.SIG_DFL
+    )  # the default action ends this process, even if its parent no longer exists
     try:
         module, _, attribute = import_path.partition(":")
         strategy = getattr(importlib.import_module(module), attribute)()

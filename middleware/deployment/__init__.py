@@ -1,1 +1,1 @@
-"""Deployment of strategies and behaviours that an operator signed to a running team (thesis, section 4.3.4)."""
+"""Deployment to a running team of strategies and behaviours that an operator has signed (thesis, section 4.3.4)."""

@@ -1,9 +1,9 @@
 """Confinement of the process that runs pushed code: irreversibly drop its privileges before the code runs.
 
-On Linux the process has no new files, sockets, processes or threads (seccomp with an allow list of system calls), no
-network (an empty network namespace), no capabilities, no root privileges, an empty root folder if permitted, SIGKILL
-when its parent ends, and limits of memory and processor time.  On other systems only the limits apply.  ``confine``
-returns which of these are in effect.
+On Linux the process cannot open files or sockets, or start processes or threads (seccomp with an allow list of system
+calls).  It has an empty network namespace, no capabilities, no root privileges, and, if permitted, an empty root
+folder.  It gets SIGKILL when its parent ends, and its memory and processor time are limited.  On other systems only
+these limits apply.  ``confine`` returns the limits in effect.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from contextlib import suppress
 MEMORY_BYTES = 256 * 1024 * 1024
 """Bytes of address space in addition to the libraries."""
 CPU_S = 3600
-"""Seconds of processor time per process; then it is killed, and restarted at the next request."""
+"""Maximum seconds of processor time of a process; it is then killed, and restarted at the next request."""
 NOBODY_ID = 65534
 
 _CLONE_NEWNET, _CLONE_NEWUSER, _CLONE_NEWIPC = 0x40000000, 0x10000000, 0x08000000
@@ -57,9 +57,9 @@ _NUMBERS: dict[str, tuple[int, int, tuple[int, ...]]] = {
 
 
 def confine(parent: int) -> list[str]:
-    """Drop all privileges that the system permits to drop; returns the names of the limits in effect.
+    """Drop all privileges that the system permits to drop; return the names of the limits in effect.
 
-    ``parent`` is the id of the process with which this one ends.
+    ``parent`` is the id of the parent process; this process ends when the parent does.
     """
     held = ["limits"] if _set_limits() else []
     if not sys.platform.startswith("linux"):

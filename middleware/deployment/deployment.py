@@ -1,9 +1,10 @@
 """Acceptance of pushed modules by one node; disabled unless the device's owner allows it.
 
-The node checks in this order: the module's name is listed, its author's key is listed, the author is an operator of the
-team now, the signature is valid, the version is newer than the current one, the source has the signed digest, the
-module loads and conforms.  Each module runs in a separate process (``runner``), after all checks have passed.
-The author's role is checked again every second: the modules of a former operator stop.
+The node accepts a module if its name and its author's key are listed in the settings, the signature is valid, and the
+author is an operator of the team now.  The version must be newer than the current one, the source must have the signed
+digest, and the module must load and conform to its interface.  Each module runs in a separate process (``runner``),
+after all checks have passed.  The author's role is checked again every second, so the modules of a former operator are
+stopped.
 """
 
 from __future__ import annotations
@@ -36,27 +37,27 @@ from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record, hash_key, parse_record
 
 RETRY_S = 2.0
-"""Seconds until a source is requested again that no node could send."""
+"""Seconds after which a source that no node could send is requested again."""
 WATCH_INTERVAL_S = 1.0
 """Seconds between two checks of authors and processes."""
 START_CHECK_INTERVAL_S = 0.05
 """Seconds between two checks of a process that is starting."""
 IDLE_S = 60.0
-"""Seconds after which the process of the previous version is ended if it is not used."""
+"""Seconds after which the unused process of a previous version is ended."""
 STORED_EDITIONS = 2
-"""Editions of one module that are stored: the running one and the previous one."""
+"""Number of stored editions of one module: the running edition and the previous one."""
 MAX_CHECKED_MANIFESTS = 256
-"""Maximum number of manifests that are remembered as checked; a dropped one is checked and reported again."""
+"""Maximum number of manifests that are remembered as checked; a forgotten manifest is checked and reported again."""
 MAX_AUTHOR_CHARACTERS = 16
 CONFINED = "seccomp"
-"""The limit without which the device reports a module as not confined."""
+"""If this limit is not in effect, the device reports the module as not confined."""
 
 Later = Callable[..., object]
 
 
 @dataclass(frozen=True)
 class Author:
-    """The author of a module: its name, and its ``roles`` now, None in an open team."""
+    """The author of a module: its name, and its current ``roles`` (None in an open team)."""
 
     name: str
     roles: frozenset[str] | None
@@ -72,9 +73,9 @@ class _Candidate:
 class Deployment:
     """The pushed modules of one node.
 
-    ``modules`` maps (kind, name) to the factory of the strategy or behaviour; agents look it up there. ``later(seconds,
-    call)`` is the node's timer, which ends with the node.  ``find_author`` returns the holder of a key, ``spawn``
-    starts a process, ``seconds`` is the monotonic clock.
+    ``modules`` maps (kind, name) to the factory of the strategy or behaviour, for the agents.  ``later(seconds, call)``
+    calls ``call`` after ``seconds``, unless the node is stopped first.  ``find_author`` returns the author with a given
+    key, ``spawn`` starts a process, and ``seconds`` is the monotonic clock.
     """
 
     _log = Logger()
@@ -248,7 +249,10 @@ class Deployment:
     # -- processes --------------------------------------------------------------------------------------------------
 
     def _start(self, candidates: list[_Candidate], is_new: bool) -> None:
-        """Start a process for the first candidate that loads; the running version is used until another is ready."""
+        """Start a process for the first candidate that loads.
+
+        The running version is used until the process is ready.
+        """
         if not candidates:
             return
         manifest, record = candidates[0].manifest, candidates[0].record
@@ -283,7 +287,7 @@ class Deployment:
         self._report()
 
     def _adopt(self, runner: Runner, candidate: _Candidate) -> None:
-        """Use this version from now on; running tasks continue with the previous one."""
+        """Use this version from now on; running tasks continue with the previous version."""
         manifest = runner.manifest
         before = self._running.get(manifest.name)
         if before is not None:
@@ -303,7 +307,7 @@ class Deployment:
         self._publish_message(f"runs {manifest.kind} {manifest.name} {manifest.label}")
 
     def _watch(self) -> None:
-        """Stop modules that may no longer run, supervise processes, and check again authors that were not operators."""
+        """Stop modules that may no longer run, supervise processes, and check rejected authors again."""
         self._later(WATCH_INTERVAL_S, self._watch)
         now = self._seconds()
         for runner, record in (*self._running.values(), *self._starting.values()):
@@ -328,7 +332,7 @@ class Deployment:
         self._report()
 
     def _stop_module(self, runner: Runner, record: Record, reason: str) -> None:
-        """Stop a module whose author may no longer push, and judge the modules of other authors again."""
+        """Stop a module whose author may no longer push modules, and check the modules of other authors again."""
         manifest = runner.manifest
         runner.stop(reason)
         self._starting.pop(manifest.name, None)

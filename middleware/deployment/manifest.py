@@ -1,7 +1,7 @@
-"""Manifests: an operator's signed statement about one module, and the order between manifests.  Pure.
+"""A manifest is an operator's signed description of one module; this module also defines their order.  Pure.
 
-A manifest is a small team record of the operator; its name is the module's.  The source is stored under a separate key
-derived from its digest, so a node that trusts the manifest can accept the source from any node.
+A manifest is a small team record of the operator, with the name of the module.  The source is stored under a separate
+key derived from its digest, so a node that trusts the manifest can accept the source from any node.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from middleware.entangled.value import check_size, is_natural, parse_mapping
 DEPLOYMENTS = "deployments"
 NAME_PATTERN = r"[a-z][a-z0-9_-]{0,31}"
 MAX_SOURCE_BYTES = 256 * 1024
-"""Maximum size of a module's source in bytes; a strategy has a few thousand."""
+"""Maximum size of a module's source in bytes; that of a strategy has a few thousand."""
 MAX_VERSION = 10**9
 MAX_PREVIOUS_EDITIONS = 4
 """Number of previous versions that a manifest lists for a rollback."""
@@ -37,7 +37,7 @@ class Edition:
 
 @dataclass(frozen=True)
 class Manifest:
-    """The edition of the module ``name`` to run, and the previous ones, newest first.
+    """The edition of the module ``name`` to run, and the previous editions, the newest first.
 
     ``withdrawn`` is the highest version that was rolled back, 0 if none was.
     """
@@ -52,10 +52,10 @@ class Manifest:
 
     @property
     def rank(self) -> tuple[int, int]:
-        """Sort key of the manifests of one name: the highest wins.
+        """The sort key of the manifests with one name: the manifest with the highest key is valid.
 
-        A higher version wins; a rollback wins over the version that it withdraws, and loses against any higher one.  So
-        a replayed old manifest has no effect.
+        A higher version has a higher key.  The key of a rollback is above that of the version that it withdraws, and
+        below that of any higher version.  So a replayed old manifest has no effect.
         """
         return (max(self.version, self.withdrawn), -self.version)
 
@@ -93,7 +93,7 @@ def manifests_key() -> bytes:
 
 
 def find_newest(manifests: Iterable[Manifest]) -> Manifest | None:
-    """Return the winning manifest among several of one name."""
+    """Return the valid manifest of several with the same name."""
     return max(manifests, key=lambda manifest: (manifest.rank, manifest.digest), default=None)
 
 
@@ -119,7 +119,7 @@ def make_rollback(held: Manifest) -> Manifest | None:
 def parse_manifest(record: Record) -> Manifest | None:
     """Return the manifest in a record, or None if its value is not a valid manifest; never raises.
 
-    Signature and permission of the author are not checked.
+    The signature and the author's permission are not checked.
     """
     content = parse_mapping(record)
     if content is None:

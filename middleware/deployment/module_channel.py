@@ -16,9 +16,9 @@ import msgpack
 LOAD, MAKE, CALL, DROP = "load", "make", "call", "drop"
 """Verbs: load the module; create an instance; call a method of an instance; delete it."""
 STRATEGY_INSTANCE = 0
-"""The instance of a strategy: strategies are pure, so one instance serves all tasks."""
+"""The number of a strategy's instance: strategies are pure, so one instance serves all tasks."""
 MAX_REQUEST_BYTES = 4 * 1024 * 1024
-"""Maximum size of a request in bytes: an observation with a picture, or a module's source."""
+"""Maximum size of a request in bytes; the largest are an observation with a picture and a module's source."""
 MAX_REPLY_BYTES = 64 * 1024
 _LENGTH = struct.Struct("!I")
 
@@ -86,7 +86,7 @@ def _parse_message(message: bytes) -> tuple[int, Any, Any]:
 
 
 class ProcessEnded(Exception):
-    """The process has ended or sent an invalid reply; the text says which."""
+    """The process has ended or sent an invalid reply; the text is the reason."""
 
 
 class Channel(Protocol):

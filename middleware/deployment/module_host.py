@@ -1,7 +1,7 @@
-"""Module side of the channel, in the module's process: load one module and answer the node's requests.
+"""The module's side of the channel, in the module's process: load one module and answer the node's requests.
 
-``confine`` is called with the module's source before the source runs; it drops the privileges of the process and
-returns the limits in effect.  Each kind of module is handled by a ``ModuleKind``.
+Before the module's source is executed, ``confine`` is called with the source; it drops the privileges of the process
+and returns the limits in effect.  A ``ModuleKind`` handles the modules of one kind.
 """
 
 from __future__ import annotations
@@ -37,20 +37,20 @@ Confine = Callable[[bytes], Sequence[str]]
 
 
 class ModuleKind(Protocol):
-    """Create and call modules of one kind, with plain values as arguments and results."""
+    """Creates and calls modules of one kind, with plain values as arguments and results."""
 
     def make(self, make: Factory, arguments: list[Any]) -> object:
         """Create an instance."""
 
     def describe_instance(self, thing: object) -> dict[str, Any]:
-        """Return the facts that the node needs about an instance."""
+        """Return the data about an instance that the node needs."""
 
     def call(self, thing: object, method: str, arguments: list[Any]) -> object:
         """Call ``method`` of an instance."""
 
 
 class StrategyKind:
-    """Handle strategies."""
+    """Handles strategies."""
 
     def make(self, make: Factory, arguments: list[Any]) -> object:
         """Create the strategy."""
@@ -66,7 +66,7 @@ class StrategyKind:
 
 
 class ModuleHost:
-    """One module, with several instances if it is a behaviour."""
+    """One module with its instances; only a behaviour can have several instances."""
 
     def __init__(self, kinds: Mapping[str, ModuleKind], confine: Confine) -> None:
         self._kinds = kinds

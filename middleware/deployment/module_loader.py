@@ -1,8 +1,8 @@
-"""Compile, run and check the source of a pushed module; the only place where pushed code is executed.
+"""Compile, run and check the source of a pushed module.
 
-This runs in the module's process after its privileges were dropped, and in the simulated counterpart of that process.
-The caller has verified the signature.  The checks here catch mistakes: source that does not parse, raises, or does not
-terminate.
+No other module executes pushed code.  This happens in the module's process, after its privileges were dropped, and in
+the simulated counterpart of that process.  The caller has verified the signature.  The checks here detect mistakes:
+source that cannot be parsed, raises an exception, or does not terminate.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from middleware.deployment.manifest import MAX_SOURCE_BYTES, Manifest, compute_d
 from middleware.errors import Undeployable
 
 FACTORY_NAMES = {STRATEGY: "Strategy", BEHAVIOUR: "Behaviour"}
-"""The name that a module of each kind must define: a class or another factory."""
+"""The name of the class, or other factory, that a module of each kind must define."""
 MAX_STEPS = 500_000
 """Maximum number of Python instructions for the import and for each check: a fraction of a second."""
 TEST_REPORTS = (Report("a" * 40, 2.0), Report("b" * 40, 1.0), Report("c" * 40, 1.0), Report("d" * 40, 3.5))
@@ -29,7 +29,7 @@ T = TypeVar("T")
 
 
 class _TooManySteps(BaseException):
-    """More than the allowed steps; not an ``Exception``, so that the module does not catch it by accident."""
+    """The code exceeded its number of steps; not an ``Exception``, so that a module does not catch it by accident."""
 
 
 def load_module(manifest: Manifest, source: bytes) -> Factory:
@@ -38,7 +38,7 @@ def load_module(manifest: Manifest, source: bytes) -> Factory:
     Raises ``Undeployable`` with the reason.
     """
     if len(source) != manifest.size or len(source) > MAX_SOURCE_BYTES or compute_digest(source) != manifest.digest:
-        raise Undeployable(manifest.name, "its source is not what was signed")
+        raise Undeployable(manifest.name, "the source does not match the signed digest and size")
     name = f"swarm_deployed_{manifest.name.replace('-', '_')}_{manifest.digest[:12]}"
     code = compile_source(source, name)
     module = ModuleType(name)
@@ -71,14 +71,15 @@ def compile_source(source: bytes, name: str) -> Any:
         return compile(ast.parse(source, f"<{name}>"), f"<{name}>", "exec", dont_inherit=True)
     except SyntaxError as error:
         raise Undeployable(name, f"line {error.lineno or 0}: {error.msg}") from error
-    except Exception as error:  # the parser raises others on crafted text (null bytes, deep nesting)
+    except Exception as error:  # the parser raises other exceptions for crafted source (null bytes, deep nesting)
         raise Undeployable(name, f"is not Python: {error}") from error
 
 
 def call_within(steps: int, call: Callable[..., T], *arguments: object) -> T:
-    """Return the result of ``call`` if it takes at most ``steps`` Python instructions; else raise.
+    """Return the result of ``call`` if it takes at most ``steps`` Python instructions; otherwise raise.
 
-    This stops accidental endless loops.  Code that catches every exception evades it, and so does one long call into C.
+    This stops accidental endless loops.  It does not stop code that catches every exception, nor a long call into C
+    code.
     """
     left = steps
 
@@ -119,7 +120,7 @@ def _label_instances(make: Factory, manifest: Manifest) -> Factory:
 
 
 def _find_violations(kind: str, make: Factory) -> Sequence[str]:
-    """Return the violations of the module's interface; empty if it conforms."""
+    """Return the rules of the interface that the module violates."""
     if kind == BEHAVIOUR:
         # Creating a behaviour takes the parameters of a task.
         lacking = [name for name in ("look", "cost", "search", "hold", "execute") if not hasattr(make, name)]

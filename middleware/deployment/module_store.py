@@ -14,10 +14,10 @@ class ModuleStore(Protocol):
     """The interface of module storage; names are file names without the suffix."""
 
     def save(self, name: str, content: bytes) -> None:
-        """Store ``content`` under ``name``; raises ``OSError``, and then the old content is unchanged."""
+        """Store ``content`` under ``name``; raise ``OSError`` with the old content unchanged."""
 
     def list_modules(self) -> list[tuple[str, bytes]]:
-        """Return all stored modules, sorted by name, except unreadable ones."""
+        """Return all readable modules, sorted by name."""
 
     def delete(self, name: str) -> None:
         """Delete ``name``; never raises."""

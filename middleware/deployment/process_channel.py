@@ -26,7 +26,7 @@ READ_BYTES = 64 * 1024
 MAX_READ_BYTES = 1024 * 1024
 """Maximum number of bytes per read."""
 ENVIRONMENT = {
-    # A fixed hash seed gives sets the same order on every machine; libraries start no threads.
+    # Give sets the same order on every machine, and keep numeric libraries from starting threads.
     "PYTHONHASHSEED": "0",
     "OPENBLAS_NUM_THREADS": "1",
     "OMP_NUM_THREADS": "1",
@@ -38,7 +38,10 @@ SANDBOX = "swarmnode.sandbox"
 
 
 class ProcessChannel:
-    """A process that runs ``python -m program``, without this process's files, environment and working folder."""
+    """A process that runs ``python -m program``.
+
+    It does not inherit the open files, environment and working folder of this process.
+    """
 
     def __init__(self, program: str = SANDBOX) -> None:
         self._folder = tempfile.mkdtemp(prefix="swarm-module-")

@@ -1,8 +1,8 @@
-"""Runner: start, call, supervise and end the process of one pushed module.
+"""Start, call, supervise and end the process of one pushed module.
 
-The node never waits for a behaviour: it sends a request and polls for the reply.  For a strategy it waits at most
-``DEADLINE_S``.  A process that is late, dies, or sends an unexpected reply is killed; the next request restarts it,
-until it was lost ``MAX_LOSSES`` times.
+The node never waits for a behaviour: it sends a request and polls for the reply.  It waits for a strategy for at most
+``DEADLINE_S``.  A process that is late, ends, or sends an unexpected reply is killed.  The next request restarts the
+process, unless it was lost ``MAX_LOSSES`` times.
 """
 
 from __future__ import annotations
@@ -63,8 +63,8 @@ class Runner:
     """The process of the module of ``manifest`` with its ``source``.
 
     ``seconds`` is the node's monotonic clock.  ``objection`` is called before each start and returns the reason why the
-    module may not run now, or an empty string.  ``why`` is the reason of the last end, ``limits`` are the limits in
-    effect in the process.
+    module may not run now, or an empty string.  ``why`` is the reason why the process last ended; ``limits`` are the
+    limits in effect in the process.
     """
 
     _log = Logger()
@@ -95,7 +95,7 @@ class Runner:
         self._started_at = 0.0
 
     def start(self) -> None:
-        """Start the process and have it load the module; poll the result with ``poll``."""
+        """Start the process, which then loads the module; ``poll`` processes the result."""
         why = self._find_objection()
         if why:
             return self.stop(why)
@@ -257,7 +257,7 @@ class PushedStrategy(RemoteStrategy):
 class BehaviourInstance:
     """One instance of a behaviour; it ends with the process that created it.
 
-    ``fault`` is the reason why it cannot be called, empty while it can.
+    ``fault`` is the reason why the instance cannot be called; empty if it can be called.
     """
 
     def __init__(self, runner: Runner, parameters: dict[str, Any], seed: int) -> None:

@@ -1,6 +1,6 @@
 """Comparison of the agents' decision records for one task.  Pure.
 
-It lists the agents that agree, and for each other agent the difference: winner, rule or version, known reports.
+The result lists the agents that agree, and how each other agent differs: in its winner, its strategy or its reports.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ MAX_DIFFERENCES = 3
 
 @dataclass(frozen=True)
 class Difference:
-    """The difference between one agent and the majority."""
+    """The difference between the decision of one agent and that of the majority."""
 
     name: str
     what: str
@@ -28,11 +28,12 @@ class Difference:
 class EpochExplanation:
     """The result of one epoch: the agents' decision records compared.
 
-    ``winner`` is the uuid that most agents named (the lowest on a tie), ``chosen`` its name.  ``agree`` are the names
-    of the agents that named it, ``of`` is the number of participants, or in large groups of the agents that have to
-    publish their decision.  ``differ`` lists agents with another winner, another rule or other reports than most agents
-    in ``agree``; the remaining fields are from the records of that majority.  ``token`` is the winner's fencing token,
-    0 if unknown; ``agreed`` is the result of a decision by number, place or vote.
+    ``winner`` is the uuid of the agent that most agents chose (the lowest uuid if there is a tie), and ``chosen`` is
+    its name.  ``agree`` are the names of the agents that chose it.  ``of`` is the number of participants; in a large
+    group, that of the agents that have to publish their decision.  ``differ`` lists the agents whose winner, strategy
+    or reports differ from those of most agents in ``agree``.  ``token`` is the winner's fencing token, 0 if unknown,
+    and ``agreed`` is the number, place or option that the strategy agreed on.  The other fields are from the records of
+    the majority.
     """
 
     epoch: int
@@ -55,7 +56,7 @@ class EpochExplanation:
 
 @dataclass(frozen=True)
 class Explanation:
-    """The explanation of a task's assignments: its rulings, newest epoch first."""
+    """The explanation of a task's assignments: the result of each epoch, the newest first."""
 
     task: str
     epochs: tuple[EpochExplanation, ...] = ()
@@ -73,7 +74,7 @@ def explain_decisions(records: Iterable[DecisionRecord]) -> Explanation:
 
 
 def format_explanation(explanation: Explanation) -> str:
-    """Return the explanation as text, newest epoch first; empty if there is no decision yet."""
+    """Return the explanation as text, the newest epoch first; empty if there is no decision yet."""
     return "".join(_format_epoch(ruling) for ruling in explanation.epochs)
 
 
@@ -117,7 +118,7 @@ def _get_basis(record: DecisionRecord) -> tuple[str, str, str]:
 
 
 def _describe_differences(record: DecisionRecord, reference: DecisionRecord, names: Mapping[str, str]) -> str:
-    """Return the differences between a decision record and the majority's; empty if there are none."""
+    """Return the differences between a decision record and that of the majority; empty if there are none."""
     differences = []
     if record.winner != reference.winner:
         differences.append(f"names {_find_name(record.winner, names)}")
@@ -151,7 +152,7 @@ def _describe_other_reports(record: DecisionRecord, reference: DecisionRecord) -
 
 
 def _format_epoch(ruling: EpochExplanation) -> str:
-    """Return one ruling as lines of text."""
+    """Return the result of one epoch as lines of text."""
     token = f", token {ruling.token}" if ruling.token else ""
     lines = [f"epoch {ruling.epoch}: {ruling.chosen}, {len(ruling.agree)} of {ruling.of} agree{token}"]
     lines.append(

@@ -1,6 +1,6 @@
 """Diagnostics of a node for other nodes: store contents, contacts, traffic and link quality.
 
-Only the paths to peers are measured on request; everything else is data that the node has anyway.
+Only the paths to peers are measured when a node requests them; all other data exists anyway.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ INVENTORY_METHOD, NETWORK_METHOD, LINKS_METHOD = "device.inventory", "device.net
 MAX_RECORDS = 16
 """Maximum number of records that are listed."""
 MAX_CONTACTS = 64
-"""Maximum number of contacts that are listed, most recently heard first."""
+"""Maximum number of contacts that are listed, those with the most recent datagram first."""
 MAX_REFUSALS = 16
-"""Maximum number of refusals that are listed, newest first."""
+"""Maximum number of refusals that are listed, the newest first."""
 MAX_MEMBERS = 256
 ENDING_S = 14 * 86_400.0
-"""Seconds before its end from which a certificate is reported as about to expire."""
+"""Seconds before the end of a certificate during which it is reported as about to expire."""
 STOPS_KEY = hash_key("halt")
 
 
@@ -42,7 +42,7 @@ def expose_diagnostics(node: SwarmNode) -> None:
 def describe_store(node: SwarmNode) -> dict[str, Any]:
     """Return the contents of the store of ``node``: counts by kind, and the newest records.
 
-    ``newest`` are [kind, name, bytes, lifetime]; ``deleted`` is the number of tombstones.
+    Each entry of ``newest`` is [kind, name, bytes, lifetime]; ``deleted`` is the number of tombstones.
     """
     store = node.store
     kinds = _find_kinds(node)
@@ -63,9 +63,9 @@ def describe_store(node: SwarmNode) -> dict[str, Any]:
 
 
 def describe_network(node: SwarmNode) -> dict[str, Any]:
-    """Return the contacts of ``node`` with round-trip time and time since the last datagram, traffic, and lookups.
+    """Return the contacts, the traffic and the recent lookups of ``node``.
 
-    ``rtt_ms`` is None before the first measurement, ``heard_s`` before the first datagram.
+    ``rtt_ms`` is the round-trip time of a contact, ``heard_s`` the seconds since its last datagram; None if unknown.
     """
     overlay, endpoint = node.entangled.overlay, node.entangled.endpoint
     traffic = endpoint.traffic
@@ -99,10 +99,10 @@ def describe_network(node: SwarmNode) -> dict[str, Any]:
 
 
 def describe_links(node: SwarmNode) -> dict[str, Any]:
-    """Return the links from ``node`` to its peers, as ``LinkMetrics.read`` does, and the recent refusals.
+    """Return the links from ``node`` to its peers (as ``LinkMetrics.read``), and the recent refusals.
 
-    Each refusal has ``who`` (a name of the team, or the beginning of a key, or empty), ``at``, ``side`` as in
-    ``Rejection``, ``code``, ``reason``, ``ago`` (seconds since the last time) and ``count``.
+    A refusal has these fields: ``who`` (the member's name, the beginning of its key, or empty), ``at`` (an address),
+    ``side`` as in ``Rejection``, ``code``, ``reason``, ``ago`` (seconds since it last occurred) and ``count``.
     """
     now = node.clock.seconds()
     rejections = node.entangled.endpoint.rejections.list_recent(now)[:MAX_REFUSALS]
@@ -126,9 +126,9 @@ def describe_links(node: SwarmNode) -> dict[str, Any]:
 def describe_team(node: SwarmNode) -> dict[str, Any]:
     """Return the team of ``node``; times are Unix timestamps.
 
-    For an open team, ``unprotected`` describes the missing protection.  A closed team has a ``name``, a ``fingerprint``
-    as in ``swarm doctor``, and ``members`` with their roles, end of certificate and whether it is renewable, those
-    first that end within ``ENDING_S``; ``me`` is this node.
+    For an open team, ``unprotected`` describes the missing protection.  For a closed team, ``name`` is its name,
+    ``fingerprint`` is that of ``swarm doctor``, and ``me`` is the uuid of this node.  ``members`` contains the members
+    with their roles and the end of their certificates; members whose certificate ends within ``ENDING_S`` are first.
     """
     closed = node.team
     if closed is None:

@@ -1,7 +1,7 @@
 """The directory: the list of all devices, split by prefix in a large team.
 
-It writes the own device's record, moves it as the team grows and shrinks, and reads other devices' records.  ``prefix``
-computes the places of a device, and ``listing`` the places to read.
+It writes the record of this node's device, moves the record when the size of the team changes, and reads the records of
+other devices.  ``prefix`` computes the keys under which a device is listed, and ``listing`` the keys to read.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from middleware.entangled.record import Record
 from middleware.entangled.replication.reader import ReadConsistency
 
 CONCURRENT_READS = 8
-"""Number of places that one listing reads concurrently."""
+"""Number of keys that one listing reads concurrently."""
 PLACEMENT_STEPS, PLACEMENT_STEP_S = 50, 0.1
-"""Number of steps for which a new node waits until it knows its neighbours, and their duration in seconds."""
+"""Maximum number of steps for which a new node waits until it knows its neighbours, and the seconds of one step."""
 PARTIAL_SEARCH_LEVELS = 2
-"""Number of depths above its own at which a device starts a partial search: about four places."""
+"""Number of levels above its own depth at which a device starts a partial search, which then reads about four keys."""
 
 Matches = Callable[[Device], bool]
 
@@ -41,8 +41,8 @@ Matches = Callable[[Device], bool]
 class Page(NamedTuple):
     """Some of the devices.
 
-    ``next_id`` is the id from which to continue (None: the end).  ``is_complete`` is False if devices in
-    this range may be missing.
+    ``next_id`` is the id from which the search continues (None: all devices were searched).  ``is_complete`` is False
+    if devices in the searched range may be missing.
     """
 
     records: list[Record]
@@ -51,7 +51,7 @@ class Page(NamedTuple):
 
 
 class Directory:
-    """The directory from the view of the node ``entangled``."""
+    """The directory as used by the node ``entangled``."""
 
     def __init__(self, entangled: EntangledNode, background: Background) -> None:
         self.depth = 0
@@ -63,7 +63,7 @@ class Directory:
 
     @property
     def size(self) -> int:
-        """The estimated number of devices; in a small team the number of known ones."""
+        """The estimated number of nodes; in a small team the number of known nodes, including this one."""
         overlay = self.entangled.overlay
         contacts = overlay.contacts()
         is_large = overlay.members.is_full or (overlay.is_large and not overlay.is_complete)
@@ -77,7 +77,7 @@ class Directory:
     # -- the own record -----------------------------------------------------------------------------------------------
 
     async def choose_initial_depth(self) -> int:
-        """Return the initial depth; in a large team, wait first until this node knows its neighbours."""
+        """Return the initial depth; in a large team, first wait until this node knows its neighbours."""
         overlay = self.entangled.overlay
         for _ in range(PLACEMENT_STEPS):
             if overlay.has_found_neighbours or not overlay.is_large:
@@ -87,12 +87,12 @@ class Directory:
         return self.depth
 
     def update_depth(self) -> int:
-        """Return the depth from now on: one more or less if the team's size has changed."""
+        """Update and return the depth, which changes by at most one when the size of the team has changed."""
         self.depth = choose_depth(self.size, self.depth)
         return self.depth
 
     def announce(self, name: str, value: bytes, depth: int) -> Deferred[Any]:
-        """Write the device's packed record at its places at ``depth``, then release its previous places."""
+        """Write the device's packed record under its keys at ``depth``, then release its previous keys."""
         lease = compute_lease(depth, self.entangled.lease)
         new_places = {(key, name) for key in compute_places(self._own_id, depth)}
         self._old_places = (self._old_places | self._current_places) - new_places
@@ -109,7 +109,7 @@ class Directory:
             self._old_places.clear()
 
         def failed(failure: Any) -> Any:
-            return failure.value.subFailure  # the previous places are kept until the next announcement
+            return failure.value.subFailure  # the record stays under the previous keys until the next announcement
 
         return DeferredList(puts, fireOnOneErrback=True, consumeErrors=True).addCallbacks(record_left, failed)
 
@@ -117,7 +117,7 @@ class Directory:
     # --------------------------------------------------------------------------------------------------
 
     async def read_neighbourhood(self) -> list[Record]:
-        """Return the devices in this device's own neighbourhood, including itself; all devices of an undivided team."""
+        """Return the records of this device and its neighbours, which are all devices if the directory is not split."""
         place = compute_prefix(self._own_id, max(0, self.depth - 1))
         records = await self.entangled.get(place.key)
         return [record for _, record in select_listed(place.key, records)] if self.depth else records
@@ -129,10 +129,11 @@ class Directory:
         on_found: Callable[[Listing], None] = lambda listing: None,
         pause: float = 0.0,
     ) -> Listing:
-        """List all devices, or those below a prefix; ``on_found`` is called each time that more of them are known.
+        """List all devices, or those with the prefix ``under``; call ``on_found`` after each batch of reads.
 
-        A ``fast`` read costs a fifth of a majority read, but may miss recent changes.  Never fails: unread places are
-        in ``Listing.missed``.  ``pause`` is the time in seconds between two batches of reads.
+        A ``fast`` read costs a fifth of a majority read, but may miss recent changes.  This method never fails: keys
+        that could not be read are in ``Listing.missed``.  ``pause`` is the time in seconds between two batches of
+        reads.
         """
         listing = Listing(max(0, self.depth - 1), under)
 
@@ -142,8 +143,7 @@ class Directory:
             except EntangledError:
                 pass
             try:
-                # If half of the replicas have failed at once, use the records of any other, but mark the place as
-                # incomplete.
+                # If there is no majority of replicas, use the records of any replica, but mark this part as incomplete.
                 listing.add_records(place, await self.entangled.get(place.key, "fast"))
                 listing.missed.append(place)
             except EntangledError:
@@ -161,10 +161,11 @@ class Directory:
     async def find_devices(
         self, count: int, matches: Matches = lambda device: True, after: bytes | None = None, most_reads: int = 64
     ) -> Page:
-        """Find ``count`` or more devices for which ``matches`` returns True, and the id to continue from.
+        """Find ``count`` or more devices for which ``matches`` returns True.
 
-        The search starts at the id ``after``, by default this device's own, so that different nodes ask different
-        replicas, and continues around the id space.  It stops after ``most_reads`` places in any case.
+        The search starts at the id ``after`` and continues around the id space.  By default it starts at this device's
+        own id, so that different nodes read from different replicas.  It stops after ``most_reads`` reads in any case;
+        the page contains the id from which to continue.
         """
         begin = self._own_id if after is None else after
         depth = max(0, self.depth - PARTIAL_SEARCH_LEVELS)

@@ -1,7 +1,8 @@
-"""A walk through the places of the directory that knows which devices it may have missed; pure.
+"""A walk through the parts of the directory, which also records the parts that could not be read; pure.
 
-After reading a place, the walk continues to the half with another key, down to the depth of the deepest device found
-there or the reader's own; the other half has the same key.  So each place is read once, and the number of reads is
+The devices of a part can be listed at a greater depth, in its two halves.  One half has the same key as the part, so it
+need not be read again.  The walk reads the other half, which has a different key, and continues down to the depth of
+the deepest device in the part, or the reader's own depth.  So each key is read once, and the number of reads is
 proportional to the number of devices.
 """
 
@@ -15,13 +16,13 @@ from middleware.entangled.identity import derive_node_id
 from middleware.entangled.record import Record
 
 MAX_READS = 20_000
-"""Maximum number of places that one listing reads; beyond it the listing is incomplete."""
+"""Maximum number of parts that one listing reads; if there are more, the listing is incomplete."""
 
 
 class Listing:
-    """The devices below ``under``; the walk reaches at least the depth ``floor``.
+    """The devices whose ids have the prefix ``under``; the walk reaches at least the depth ``floor``.
 
-    ``reads`` is the number of places read; ``missed`` are the places that could not be read.
+    ``reads`` is the number of parts that were read; ``missed`` are the parts that could not be read.
     """
 
     def __init__(self, floor: int = 0, under: Prefix = ROOT) -> None:
@@ -33,7 +34,7 @@ class Listing:
         self.missed: list[Prefix] = []
 
     def take_next(self) -> Prefix | None:
-        """Return a place to read now, or None if none is known (call again after the next ``add_records``)."""
+        """Return a part to read now, or None if there is none before the next ``add_records``."""
         if not self._unread:
             return None
         if self.reads >= MAX_READS:
@@ -61,33 +62,33 @@ class Listing:
             place = place.same_key_half
 
     def on_failure(self, place: Prefix) -> None:
-        """Record that no replica of ``place`` answered."""
+        """Record that no replica of the part ``place`` answered."""
         self._pending_reads -= 1
         self.missed.append(place)
 
     @property
     def is_over(self) -> bool:
-        """Whether all places have been read."""
+        """Whether no part remains to be read."""
         return not (self._unread or self._pending_reads)
 
     @property
     def is_complete(self) -> bool:
-        """Whether every place was read, so that no device at the depth of its neighbours was missed."""
+        """Whether every part was read, so no device that is listed at the depth of its neighbours is missing."""
         return self.is_over and not self.missed
 
     @property
     def devices(self) -> list[tuple[Device, Record]]:
-        """The devices found with their records, sorted by key."""
+        """The devices that were found, each with its record, sorted by public key."""
         return [self._found[owner] for owner in sorted(self._found)]
 
     @property
     def records(self) -> list[Record]:
-        """The records of the devices found."""
+        """The records of the devices that were found."""
         return [record for _, record in self.devices]
 
 
 def select_listed(key: bytes, records: Iterable[Record]) -> list[tuple[Device, Record]]:
-    """Return the devices in ``records`` whose places include ``key``; other records are ignored."""
+    """Return the devices in ``records`` that are listed under ``key``; other records are ignored."""
     known = [(device, record) for record in records if (device := parse_device(record)) is not None]
     return [
         (device, record)

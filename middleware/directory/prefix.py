@@ -1,11 +1,13 @@
-"""The places of devices in the directory, and the depth to which it is split; pure.
+"""The keys under which devices are listed in the directory, and the depth to which the directory is split; pure.
 
-The directory is a trie over node ids.  The place of a device at depth d is the directory's key with its first d bits
-replaced by the first d bits of the device's id.  So depth 0 is one key for all, and each key of a depth is also a key
-of the next one.  The k nodes closest to a place are neighbours of the devices that it lists, so no lookup is needed.
+The directory is a trie over node ids.  A *place* is one of its parts: at depth d, it lists the devices whose ids start
+with the same d bits.  The key of a place is the key of the directory with its first d bits replaced by these bits.  At
+depth 0 there is a single place for all devices.  A split leaves one half of a place under the same key, so each key at
+a depth is also a key at the next depth.  The k nodes closest to the key of a place are neighbours of the devices that
+it lists, so these devices need no lookup to find them.
 
-A device is listed at two depths, its own and the one above.  So nodes that read at its neighbours' depth or one less
-find it, and when it moves by one depth, one of its places stays the same.
+A device is listed at two depths: its own depth and one less.  So a node that reads at either of these depths finds the
+device, and when the depth of the device changes by one, one of its two places remains the same.
 """
 
 from __future__ import annotations
@@ -21,22 +23,22 @@ from middleware.entangled.kademlia.distance import distance
 
 BITS = 8 * ID_BYTES
 MIN_DEVICES_PER_PLACE = 12
-"""Estimated minimum number of devices at a place: for each listed device about two of them hold its records."""
+"""Minimum estimated number of devices per place."""
 MAX_UNDIVIDED = 64
-"""Maximum size of a team with complete membership that has one place; in larger teams no node knows all."""
+"""Maximum size of a team whose directory is not split; in larger teams no node knows all others."""
 UNDIVIDED_AGAIN = 48
-"""Size below which a team that was larger has one place again."""
+"""Maximum size of a team that has shrunk at which its directory is no longer split."""
 ROOT_LISTED_DEPTH = 2
 DEPTH_HYSTERESIS = 0.25
-"""Hysteresis, in powers of two of the size, before a device moves."""
+"""Change of the team's size, in powers of two, by which a limit must be passed before the depth of a device changes."""
 NEAREST_CONTACTS = 8
-"""Number of nearest contacts by which the size of a team is estimated: a node knows these reliably."""
+"""Number of nearest contacts from which the size of a team is estimated, because a node knows all of these."""
 MAX_LEASE_S = 60.0
 """Maximum seconds for which a failed device remains listed."""
 
 
 class Prefix(NamedTuple):
-    """The ids that start with the ``depth`` bits of ``bits``."""
+    """A place: the ids whose first ``depth`` bits are ``bits``."""
 
     depth: int
     bits: int
@@ -49,12 +51,12 @@ class Prefix(NamedTuple):
 
     @property
     def same_key_half(self) -> Prefix:
-        """The half with the same key."""
+        """The half of this place that has the same key."""
         return Prefix(self.depth + 1, self.bits << 1 | self._next_bit)
 
     @property
     def other_key_half(self) -> Prefix:
-        """The half with another key."""
+        """The half of this place that has a different key."""
         return Prefix(self.depth + 1, self.bits << 1 | 1 - self._next_bit)
 
     @property
@@ -83,15 +85,15 @@ def compute_prefix(node_id: bytes, depth: int) -> Prefix:
 def compute_places(node_id: bytes, depth: int) -> list[bytes]:
     """Return the one to three keys under which a device with that id and depth is listed.
 
-    Up to ``ROOT_LISTED_DEPTH`` depth 0 is included: when a team becomes undivided, some nodes read only that place
-    earlier.
+    Up to ``ROOT_LISTED_DEPTH``, the key of depth 0 is included: when a team shrinks, some nodes already read only this
+    key while others are still at a greater depth.
     """
     depths = (depth, max(0, depth - 1), *((0,) if depth <= ROOT_LISTED_DEPTH else ()))
     return list(dict.fromkeys(compute_prefix(node_id, each).key for each in depths))
 
 
 def is_place(key: bytes, node_id: bytes) -> bool:
-    """Return whether ``key`` is a place of a device with that id at any depth."""
+    """Return whether a device with that id can be listed under ``key`` at any depth."""
     if key[MAX_DEPTH // 8 :] != DEVICES[MAX_DEPTH // 8 :]:
         return False
     return any(key == compute_prefix(node_id, depth).key for depth in range(MAX_DEPTH + 1))
@@ -114,7 +116,8 @@ def choose_depth(size: float, depth: int | None = None) -> int:
 def compute_lease(depth: int, lease: float) -> float:
     """Return the seconds for which a device at ``depth`` remains listed after its last renewal.
 
-    ``lease`` is the lease of its node.  Twice as many devices renew half as often, up to a minute.
+    ``lease`` is the presence lease of its node.  If there are twice as many devices, each renews half as often, but at
+    least every minute.
     """
     return lease if not depth else max(lease, min(MAX_LEASE_S, lease * 2.0**depth))
 

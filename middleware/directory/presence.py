@@ -1,7 +1,8 @@
 """Presence: the record in which each device announces its capabilities and status.
 
-The record is owner-leased, so it disappears with its node.  The order of joining is a number, one more than the highest
-that the device found, so it needs no common clock and is the same at every node.
+The node renews the lease of the record, so the record disappears when the node does.  When a device joins, it takes a
+number one higher than the highest number that it finds.  The order of these numbers is the order of joining; it needs
+no common clock and is the same at every node.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ DEVICES = hash_key("devices")
 IDLE, ASSIGNED, SEARCHING, WAITING, EXECUTING, DONE = "IDLE", "ASSIGNED", "SEARCHING", "WAITING", "EXECUTING", "DONE"
 STATUSES = (IDLE, ASSIGNED, SEARCHING, WAITING, EXECUTING, DONE)
 MAX_DEPTH = 16
-"""Maximum depth of the directory: 2**16 places are enough for a million devices."""
+"""Maximum depth of the directory: 2**16 parts are enough for a million devices."""
 SHOWN_ID_CHARACTERS = 6
 MAX_MESSAGES = 5
 MAX_MESSAGE_CHARACTERS = 70
@@ -36,17 +37,19 @@ class Device:
     """The presence record of a device (thesis, Algorithm 4.3).
 
     - ``uuid``: the node id in hex
-    - ``joined``: the device's number in the order of joining
+    - ``joined``: the device's number in the order of joining, from 1
     - ``since``: wall-clock seconds, for display
     - ``messages``: the newest (time, text) lines
-    - ``deployed``: for each deployed module the version and digest that runs, or the reason why it was rejected
-    - ``pages``: the URLs at which it serves the page
+    - ``deployed``: for each deployed module the running version with its digest, or the reason why the module was
+      rejected
+    - ``pages``: the URLs at which the device's node serves the page
     - ``position``: ``x`` and ``y`` in metres and ``heading`` in radians on the simulator's map, or ``lat`` and ``lon``
       in degrees with ``accuracy`` in metres
     - ``laptop``, ``agent``: display names of the computer and of the agent (thesis, Table 5.1)
-    - ``depth``: the depth of its place in the directory (``middleware.directory.prefix``)
-    - ``stops``: the ids in hex of the stops that it obeys, at most ``MAX_STOPS``
-    - ``obeys``: its activity while the team is stopped (``middleware.stop.stop_state``)
+    - ``depth``: the depth at which the device is listed in the directory (``middleware.directory.prefix``)
+    - ``stops``: the ids, in hex, of the emergency stops in force that the device has received, at most ``MAX_STOPS``
+    - ``obeys``: the activity of the device while the team is stopped, such as
+      ``middleware.stop.stop_state.STANDS_STILL``
     """
 
     uuid: str
@@ -72,19 +75,19 @@ class Device:
     obeys: str = ""
 
     def with_message(self, now: float, text: str) -> Device:
-        """Return this device with one more line; at most ``MAX_MESSAGES`` are kept."""
+        """Return this device with one more message; only the newest ``MAX_MESSAGES`` are kept."""
         line = (now, text[:MAX_MESSAGE_CHARACTERS])
         return replace(self, messages=(*self.messages, line)[-MAX_MESSAGES:])
 
     def pack(self) -> bytes:
-        """Return the value of its record.
+        """Return the value of the device's record.
 
-        If it is too large, messages, description and ``deployed`` are removed in that order.
+        If the value is too large, the messages, the description and ``deployed`` are removed, in that order.
         """
         device = self
         while True:
             content = dict(vars(device))
-            # most devices have none of these, and records are sent often
+            # omit empty fields: most devices have none of these, and the record is sent often
             for name in ("pages", "position", "laptop", "agent", "depth", "stops", "obeys"):
                 if not content[name]:
                     del content[name]
@@ -100,9 +103,9 @@ class Device:
 
 
 def parse_device(record: Record) -> Device | None:
-    """Decode the device in a record; None if it is invalid or of another node.
+    """Decode the device in a record; None if the record is invalid or describes a device of another node.
 
-    Its name must be the name of the record's slot, which replicas compare with the owner's certificate.
+    The device's name must be the name of the record's slot, which replicas compare with the owner's certificate.
     """
     value = parse_mapping(record)
     if value is None or value.get("uuid") != derive_node_id(record.owner).hex() or value.get("name") != record.name:
@@ -143,9 +146,9 @@ def parse_device(record: Record) -> Device | None:
 
 
 def parse_devices(records: list[Record]) -> list[tuple[Device, Record]]:
-    """Decode the devices in ``records``, sorted by their order of joining, each with its record.
+    """Decode the devices in ``records``, each with its record, in the order of joining.
 
-    Devices with equal names get a prefix of their id appended.
+    If several devices have the same name, the first characters of its id are appended to the name of each.
     """
     known = [(device, record) for record in records if (device := parse_device(record)) is not None]
     counts = Counter(name for name, _ in {(device.name, device.uuid) for device, _ in known})
@@ -166,7 +169,7 @@ Later = Callable[[float, Callable[[], None]], object]
 
 
 class Presence:
-    """This node's own device record, announced after changes at most every ``PAUSE_S`` seconds."""
+    """The record of this node's own device, which is announced after changes, at most every ``PAUSE_S`` seconds."""
 
     PAUSE_S = 0.1
 
@@ -184,7 +187,7 @@ class Presence:
         self._announce(self.device.pack())
 
     def change(self, **changes: Any) -> None:
-        """Announce changed fields; unchanged ones cause no message."""
+        """Announce the changed fields; if none has changed, nothing is sent."""
         device = replace(self.device, **changes)
         if device == self.device:
             return
@@ -198,7 +201,7 @@ class Presence:
         self.change(messages=self.device.with_message(now, text).messages)
 
     def announce_stops(self, stops: Collection[bytes], words: str) -> None:
-        """Announce the stops that the device obeys, and its activity; without stops it continues normally."""
+        """Announce the stops in force that the device has received, and its activity (``words``)."""
         self.change(stops=tuple(stop.hex() for stop in list(stops)[-MAX_STOPS:]), obeys=words)
 
     def _publish(self) -> None:

@@ -1,7 +1,7 @@
 """A subscription to the list of all devices, for teams of any size.
 
-In an undivided team the single place is watched.  In a larger one the places are read in turn, at a constant rate:
-watching a thousand keys would need a thousand times the renewals.
+As long as the directory has a single key, this key is watched.  In a larger team the keys are read one after another,
+at a constant rate, because watching a thousand keys would need a thousand times as many renewals.
 """
 
 from __future__ import annotations
@@ -16,18 +16,19 @@ from middleware.entangled.record import Record
 from middleware.entangled.replication.watch import OnChanged, Watch
 
 READS_PER_S = 16
-"""Maximum number of places that a follower reads per second: it reads 10,000 devices again about once a minute."""
+"""Maximum number of keys that are read per second: 10,000 devices are read about once a minute."""
 ROUND_PAUSE_S = 2.0
 """Minimum seconds between two rounds."""
 DEPTH_MARK = b"\xa5depth"
-"""Part of the record of each device that is not at depth 0."""
+"""Byte sequence in the record of each device that is not at depth 0."""
 
 
 class DeviceSubscription:
-    """Calls ``changed`` with all devices' records when they have changed; ``records`` are the current ones.
+    """Calls ``changed`` with the records of all devices after each change; ``records`` are the current records.
 
-    With ``keep`` the records of an undivided team are also kept in the node's store.  In a large team one replica of
-    each place is asked, which may miss some records, so a device is removed only after two rounds without it.
+    If ``keep`` is true and the directory has a single key, the records are also kept in the node's store.  In a large
+    team one replica of each key is read.  A single replica may lack some records, so a device is removed only if it was
+    missing in two successive rounds.
     """
 
     def __init__(self, directory: Directory, changed: OnChanged, keep: bool = False) -> None:
@@ -57,7 +58,7 @@ class DeviceSubscription:
             self._notify(records)
 
     async def _read_repeatedly(self) -> None:
-        """Read all places repeatedly, until the team is small again."""
+        """Read all keys repeatedly, until the team is small again."""
         while not self._is_stopped:
             listing = await self._directory.list_devices(
                 "fast", on_found=self._report_new, pause=CONCURRENT_READS / READS_PER_S
@@ -80,7 +81,7 @@ class DeviceSubscription:
         self._notify(newest.values())
 
     def _remove_missing(self, listing: Listing) -> None:
-        """Remove devices that were missing in this round and the last, although their place was read."""
+        """Remove devices that were missing in this round and the previous round, although their keys were read."""
         seen = {record.owner for record in listing.records}
         unseen = {
             record.owner

@@ -1,7 +1,7 @@
-"""The faults of one node: take orders, apply each fault for its seconds, and remove it.
+"""Inject faults into one node: accept orders, apply each fault for its duration, and remove it.
 
-An ordered fault goes through ``TRANSITIONS``.  Faults of different kinds are active side by side; a new one of the same
-kind replaces the one before.
+The states of an ordered fault are connected by ``TRANSITIONS``.  Faults of different kinds can be active at the same
+time; a new fault replaces an active fault of the same kind.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from middleware.node import SwarmNode
 from middleware.tasks.task import Task
 
 MakeTask = Callable[[str, str, float], Task]
-"""Creates a predefined task from its name, a new task id, and the wall clock."""
+"""Creates a predefined task from its name, a new task id, and the wall-clock time."""
 BATTERY_LEVEL = "power.level"
 START_DELAY_S = 0.5
-"""Seconds from the reply to the fault: a node that is isolated or dead could not confirm the order.  With packet loss,
-the reply may have to be sent several times."""
+"""Seconds between the reply and the fault, because an isolated or dead node cannot confirm the order.  With packet
+loss, the reply may have to be sent several times in this time."""
 
 
 class State(Enum):
@@ -57,7 +57,8 @@ TRANSITIONS: Mapping[tuple[State, Event], State] = {
     (State.ACTIVE, Event.END): State.OVER,
     (State.OVER, Event.END): State.OVER,
 }
-"""The end of a replaced fault occurs as well, and has no effect.  Every other pair is a programming error."""
+"""The END event of a replaced fault also occurs, but has no effect.  Every pair of state and event that is not in this
+table is a programming error."""
 
 
 class Process(Protocol):
@@ -77,7 +78,7 @@ class _OrderedFault:
     state: State = State.ORDERED
 
     def advance(self, event: Event) -> bool:
-        """Go to the next state; returns whether the state has changed."""
+        """Go to the next state; return whether the state has changed."""
         before, self.state = self.state, TRANSITIONS[self.state, event]
         return self.state is not before
 
@@ -95,9 +96,9 @@ class SkewedClock:
 
 
 class LowBattery:
-    """Forward everything to ``driver``, but report at most ``level`` (0 to 1) as its charge; None: the real charge.
+    """Forwards everything to ``driver``, but reports a charge of at most ``level`` (0 to 1); None: the real charge.
 
-    The robot still obeys commands; its agent has to give up the task.
+    The robot still obeys commands; it is the agent that has to give up the task.
     """
 
     def __init__(self, driver: Any) -> None:
@@ -108,11 +109,11 @@ class LowBattery:
         return getattr(self._driver, name)
 
     def observe(self) -> Any:
-        """Return the newest observation with the limited level; None before the first."""
+        """Return the newest observation with the limited charge; None before the first observation."""
         return self._limit(self._driver.observe())
 
     def subscribe(self, seen: Callable[[Any], None]) -> Callable[[], None]:
-        """Call ``seen`` with each observation with the limited level; the result ends the subscription."""
+        """Call ``seen`` with each observation, with the limited charge; the returned function ends the subscription."""
         end: Callable[[], None] = self._driver.subscribe(lambda observation: seen(self._limit(observation)))
         return end
 
@@ -127,8 +128,8 @@ class FaultInjector:
     """Faults of one node.
 
     The node must use ``wall`` as its wall clock, and open its port through ``open_network``; its agent must use the
-    driver from ``wrap_driver``.  Without a ``process`` the node cannot be killed or frozen, without a driver its
-    battery cannot read low.
+    driver from ``wrap_driver``.  If ``process`` is None, the node cannot be killed or frozen; if no driver is wrapped,
+    its battery cannot read low.
     """
 
     _log = Logger()
@@ -157,14 +158,14 @@ class FaultInjector:
         return self._network
 
     def wrap_driver(self, driver: Any) -> Any:
-        """Return ``driver`` with a battery level that can be made to read low."""
+        """Return ``driver`` with a charge that the fault ``battery`` can lower."""
         self._battery = LowBattery(driver)
         return self._battery
 
     def expose(self, node: SwarmNode, make_task: MakeTask) -> None:
-        """Let other nodes order faults of ``node``, list them, and publish a predefined task for a scenario.
+        """Let other nodes order and list the faults of ``node``, and publish a predefined task for a scenario.
 
-        ``make_task`` raises ``UnknownTask`` for a name that it does not know.
+        ``make_task`` must raise ``UnknownTask`` for an unknown name.
         """
 
         def cause(peer: Contact, kind: object, seconds: object, amount: object) -> float:
@@ -174,7 +175,7 @@ class FaultInjector:
                 raise Refused(str(error)) from error
             if fault.kind not in self.list_kinds():
                 raise Refused(
-                    f"kind: this device cannot have {fault.kind}; choose one of {', '.join(self.list_kinds())}"
+                    f"kind: this device does not support {fault.kind}; choose one of {', '.join(self.list_kinds())}"
                 )
             node.later(START_DELAY_S, self._begin, node, _OrderedFault(fault))
             return START_DELAY_S
@@ -225,7 +226,7 @@ class FaultInjector:
             self._apply()
 
     def _apply(self) -> None:
-        """Apply the active faults, and no others."""
+        """Apply exactly the active faults."""
 
         def amount(kind: str, otherwise: float = 0.0) -> float:
             return self._active[kind].fault.amount if kind in self._active else otherwise

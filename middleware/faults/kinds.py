@@ -1,6 +1,7 @@
-"""The faults that can be injected into a node, with their bounds, for page, command line, scenarios and node.  Pure.
+"""The faults that can be injected into a node, with their bounds.
 
-Every fault ends by itself: a device that is cut off would not receive an order to end it.
+Pure; used by the page, the command line, scenarios and nodes.  Every fault ends by itself, because an isolated device
+would not receive an order to end its fault.
 """
 
 from __future__ import annotations
@@ -12,18 +13,20 @@ from middleware.entangled.value import is_number
 from middleware.errors import BadFault
 
 CAUSE_METHOD, LIST_METHOD, ASSIGN_METHOD = "device.fault", "device.faults", "device.assign"
-"""Methods of a node that allows faults: inject one; list its kinds and the active ones; publish a predefined task."""
+"""Methods of a node that allows faults: inject a fault; list the supported kinds and the active faults; publish a
+predefined task."""
 MIN_S, MAX_S, DEFAULT_S = 0.1, 600.0, 15.0
 MAX_DELAY_S = 2.0
-"""The longest delay between the answer of a device and its fault."""
+"""Maximum seconds between the answer of a device to the order and the beginning of its fault."""
 
 
 @dataclass(frozen=True)
 class FaultKind:
     """The properties of one kind of fault.
 
-    ``is_lost``: a device that executes a task has to be replaced.  A kind with a ``unit`` has an amount: ``amount`` is
-    its default, ``least`` and ``most`` are its bounds, and ``means`` is its meaning in words.
+    ``is_lost``: if the device executes a task, another device has to take over.  A kind with a ``unit`` has an amount:
+    ``amount`` is the default, ``least`` and ``most`` are the bounds, and ``means`` is the meaning of the amount in
+    words.
     """
 
     about: str
@@ -53,7 +56,7 @@ KINDS: Mapping[str, FaultKind] = {
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault of a ``kind`` out of ``KINDS`` that lasts for ``seconds``."""
+    """A fault that lasts for ``seconds``; ``kind`` is one of ``KINDS``."""
 
     kind: str
     seconds: float = DEFAULT_S
@@ -61,25 +64,25 @@ class Fault:
 
 
 def parse_fault(kind: object, seconds: object = None, amount: object = None) -> Fault:
-    """Check the fields of a fault that come from outside; None means the default.  Raises ``BadFault``."""
+    """Check the fields of a fault from an untrusted source; None means the default.  Raise ``BadFault``."""
     if not isinstance(kind, str) or kind not in KINDS:
         raise BadFault("kind", f"there is no fault {str(kind)[:40]!r}", f"choose one of {', '.join(KINDS)}")
     rule = KINDS[kind]
     lasts = _check_number("seconds", DEFAULT_S if seconds is None else seconds, MIN_S, MAX_S, "s")
     if not rule.unit:
         if amount is not None and amount != 0:
-            raise BadFault("amount", f"a fault of the kind {kind} has none", "leave it out")
+            raise BadFault("amount", f"a fault of the kind {kind} has no amount", "leave the amount out")
         return Fault(kind, lasts)
     much = _check_number("amount", rule.amount if amount is None else amount, rule.least, rule.most, rule.unit)
     return Fault(kind, lasts, much)
 
 
 def parse_delay(answer: object) -> float:
-    """Return the seconds until a fault begins from a device's answer to the order; 0 for an invalid answer."""
+    """Decode a device's answer to the order: the seconds until the fault begins; 0 for an invalid answer."""
     return float(answer) if is_number(answer) and 0.0 < answer <= MAX_DELAY_S else 0.0  # type: ignore[operator,arg-type]
 
 
 def _check_number(field: str, value: object, least: float, most: float, unit: str) -> float:
     if not is_number(value) or not least <= value <= most:  # type: ignore[operator]
-        raise BadFault(field, f"{str(value)[:40]} is out of range", f"give {least:g} to {most:g} {unit}")
+        raise BadFault(field, f"{str(value)[:40]} is out of range", f"it must be from {least:g} to {most:g} {unit}")
     return float(value)  # type: ignore[arg-type]

@@ -1,7 +1,7 @@
-"""Faults of one node's datagrams: loss, delay, duplicates, and loss of one direction or both.
+"""Faults of one node's datagrams: loss, delay, duplication, and the loss of all datagrams in one direction or both.
 
-``FaultyNetwork`` wraps any other ``Network``.  It does to a real node's port what the switchboard does between
-simulated nodes.  Initially there are no faults.
+``FaultyNetwork`` wraps any other ``Network``.  Its faults of a real node's datagrams are those that the switchboard
+causes between simulated nodes.  Initially there are no faults.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from middleware.entangled.network.switchboard import PERFECT
 class FaultyNetwork:
     """``network`` with faults.
 
-    ``conditions`` applies to each datagram sent and to each one received, so to a request and its response twice.
+    ``conditions`` applies to each sent and each received datagram, so it applies twice to a request with its reply.
     ``is_receive_blocked``: nothing is received; ``is_send_blocked``: nothing is sent.
     """
 
@@ -53,7 +53,7 @@ class FaultyNetwork:
         return find_alternate_paths(self._network)
 
     def listen(self, receiver: Receiver) -> None:
-        """Open the port, and call ``receiver`` with datagrams that pass; raises ``PortInUse`` if it is in use."""
+        """Open the port, and call ``receiver`` with each datagram that no fault drops; raise ``PortInUse``."""
         self._network.listen(self._on_datagram)
         self._receiver = receiver
 
@@ -72,7 +72,7 @@ class FaultyNetwork:
             self._forward(self._deliver_received, datagram, source)
 
     def _forward(self, deliver: Receiver, datagram: bytes, address: Address) -> None:
-        """Forward a datagram according to the conditions: now, late, twice or not at all."""
+        """Forward a datagram according to ``conditions``: immediately, delayed, twice or not at all."""
         for delay in (0.0,) if self.conditions is PERFECT else self.conditions.draw_delays(self._rng):
             if delay > 0.0:
                 self._clock.callLater(delay, deliver, datagram, address)

@@ -11,11 +11,11 @@ class OwnProcess:
     """The process that runs this code."""
 
     def kill(self) -> None:
-        """End at once by SIGKILL: nothing is sent, nothing is written."""
+        """Kill the process by SIGKILL, so it can neither send nor write anything."""
         os.kill(os.getpid(), signal.SIGKILL)
 
     def freeze(self, seconds: float) -> None:
-        """Stop by SIGSTOP; a child started before sends SIGCONT, since a stopped process has no timers."""
+        """Stop by SIGSTOP; a child process sends SIGCONT after ``seconds``, because a stopped process has no timers."""
         wake = f"sleep {seconds:.3f}; kill -CONT {os.getpid()}"
         quiet = subprocess.DEVNULL
         # The child has a separate session, so a signal to this process group does not stop it.

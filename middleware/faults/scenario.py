@@ -1,4 +1,4 @@
-"""A scenario: faults with their times from a TOML file, so that a run can be repeated."""
+"""Scenarios: faults with their times, loaded from a TOML file, so that a run can be repeated."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class _File:
 
 @dataclass(frozen=True)
 class Step:
-    """One fault: at ``at`` seconds, of the device with that name, of the executing device, or of a random one."""
+    """One fault, ``at`` seconds after the start; ``device`` is a name, ``EXECUTING_DEVICE`` or ``ANY_DEVICE``."""
 
     at: float
     device: str
@@ -49,9 +49,9 @@ class Step:
 
 @dataclass(frozen=True)
 class Scenario:
-    """A predefined task that is assigned first (none if empty), and the faults in order of time.
+    """The name of a predefined task that is assigned first (empty: no task), and the faults in order of time.
 
-    ``seed`` selects the devices for "any".
+    ``seed`` is the seed of the random choice of devices for ``ANY_DEVICE``.
     """
 
     task: str
@@ -65,7 +65,9 @@ def load_scenario(path: Path) -> Scenario:
         return parse_scenario(tomllib.loads(path.read_text(encoding="utf-8")), str(path))
     except OSError as error:
         problem = f"cannot be read: {error.strerror or error}"
-        raise BadSetting(str(path), "", problem, "name a scenario, such as examples/scenarios/takeover.toml") from error
+        raise BadSetting(
+            str(path), "", problem, "use a readable file, such as examples/scenarios/takeover.toml"
+        ) from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise BadSetting(str(path), "", f"is not TOML: {error}", "fix that line") from error
 

@@ -1,6 +1,6 @@
-"""Run a scenario of faults on a stage, and measure the time of each takeover.
+"""Run a scenario of faults on a team, and measure the time of each takeover.
 
-The stage is a running team (``swarm chaos``) or a simulated one in virtual time; both run the same steps.
+The team is a running team (``swarm chaos``) or a simulated team in virtual time; the steps are the same for both.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ POLL_INTERVAL_S = 0.05
 DEVICE_TIMEOUT_S = 60.0
 """Seconds to wait for an executing device, or for the device with a given name."""
 SETTLE_S = 6.0
-"""Seconds after a fault without a takeover within which the remaining devices can end the task."""
+"""Seconds after a fault for which a takeover is awaited; in this time the remaining devices may also end the task."""
 ROLES_WITHOUT_ROBOT = {"bootstrap", "web"}
 
 
 class DeviceNotPresent(Exception):
-    """The device for a fault is not present; ``str()`` is one line for display."""
+    """The device that should get a fault is not present; ``str()`` is one line for display."""
 
 
 class TeamUnderTest(Protocol):
-    """A team for fault scenarios; ``seconds`` is its clock."""
+    """A team for fault scenarios, with its clock."""
 
     def seconds(self) -> float:
         """Return the time in seconds."""
@@ -40,10 +40,10 @@ class TeamUnderTest(Protocol):
         """Return the present devices, in the order of joining."""
 
     def assign(self, task: str) -> str:
-        """Publish a predefined task; returns its id."""
+        """Publish a predefined task, and return its id."""
 
     def inject(self, device: Device, fault: Fault) -> float:
-        """Inject the fault into the device; returns the seconds until it begins, when the device has confirmed."""
+        """Inject the fault; when the device has confirmed, return the seconds until the fault begins."""
 
     def is_over(self, task_id: str) -> bool:
         """Return whether the task has ended."""
@@ -51,7 +51,7 @@ class TeamUnderTest(Protocol):
 
 @dataclass
 class FaultOutcome:
-    """One fault of a device and its takeover; ``is_ended``: the task ended before a takeover."""
+    """One fault of a device, and the takeover after it; ``is_ended``: the task ended before a takeover."""
 
     device: str
     fault: Fault
@@ -66,7 +66,7 @@ class FaultOutcome:
 
     @property
     def is_within_target(self) -> bool:
-        """Whether another device took over in time, if that was necessary."""
+        """Whether another device took over in time, or no takeover was necessary."""
         if self.takeover.seconds is not None:
             return self.takeover.seconds <= TARGET_S
         must = self.is_lost and self.fault.seconds > TARGET_S
@@ -89,7 +89,7 @@ class FaultOutcome:
 
 
 def run_scenario(scenario: Scenario, seed: int, team: TeamUnderTest, say: Callable[[str], None]) -> list[FaultOutcome]:
-    """Run the scenario, and report each loss when it is settled; raises ``DeviceNotPresent``."""
+    """Run the scenario, and report the outcome of each fault as soon as it is known; raise ``DeviceNotPresent``."""
     rng = random.Random(seed)
     losses: list[FaultOutcome] = []
     if scenario.task:
@@ -118,7 +118,7 @@ def _is_open(loss: FaultOutcome, now: float) -> bool:
 
 
 def _is_given_up(loss: FaultOutcome, now: float) -> bool:
-    # A killed process has no end of its fault, and the end of a long fault is not awaited.
+    # The fault of a killed process never ends, and the end of a long fault is not awaited.
     return now > loss.takeover.began + max(SETTLE_S, min(loss.fault.seconds, 3 * SETTLE_S))
 
 
@@ -159,7 +159,7 @@ def _matching_devices(team: TeamUnderTest, wanted: str, losses: Iterable[FaultOu
         )
     if wanted != EXECUTING_DEVICE:
         return [device for device in present if device.name == wanted]
-    # An isolated device still reports that it executes the task; skip it.
+    # Skip an isolated device: its last presence record still says that it executes the task.
     lost = {loss.takeover.lost for loss in losses if loss.is_lost and team.seconds() < loss.takeover.until}
     acts = find_executing(present)
     return [device for device in present if device.uuid in acts and device.uuid not in lost]

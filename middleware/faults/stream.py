@@ -1,4 +1,4 @@
-"""Faults of a byte stream, such as the link of an emulated robot, set by tests or by hand."""
+"""Faults of a byte stream, for example of the link to an emulated robot; tests or a user set them."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from dataclasses import dataclass
 class StreamFaults:
     """The faults of one stream.
 
-    ``drop`` and ``garbage`` are the shares of writes that are lost and corrupted, ``delay`` is in seconds.
-    ``half_open``: the robot receives and sends nothing, but its link stays open.  ``split``: each write is cut at
-    random places, as a network may do.
+    ``drop`` is the share of writes that are lost, ``garbage`` the share of writes that are corrupted, and ``delay`` is
+    in seconds.  ``half_open``: the robot receives and sends nothing, but its link stays open.  ``split``: each write is
+    split into chunks of random size, as a network may do.
     """
 
     drop: float = 0.0
@@ -23,7 +23,7 @@ class StreamFaults:
     split: bool = False
 
     def apply(self, data: bytes, rng: random.Random) -> Iterator[bytes]:
-        """Yield the pieces of ``data`` that are sent, in order; none if it is lost."""
+        """Yield the chunks of ``data`` that are sent, in order; nothing if ``data`` is lost."""
         if self.half_open or rng.random() < self.drop:
             return
         if data and rng.random() < self.garbage:

@@ -10,11 +10,11 @@ from middleware.directory.presence import EXECUTING, Device
 TARGET_S = 2.0
 """Seconds within which another device should take over."""
 OBSERVATION_S = 5.0
-"""Seconds after the end of a fault in which a takeover still counts."""
+"""Seconds after the end of a fault within which a takeover is still recorded."""
 
 
 def find_executing(devices: Iterable[Device]) -> dict[str, str]:
-    """Return the devices that execute a task: uuid to task."""
+    """Return the task id of each device that executes a task, by uuid."""
     return {device.uuid: device.task for device in devices if device.status == EXECUTING and device.task}
 
 
@@ -22,9 +22,10 @@ def find_executing(devices: Iterable[Device]) -> dict[str, str]:
 class Takeover:
     """The takeover after one fault of the device ``lost``.
 
-    ``task`` is the task that the device executed, empty if it executed none: then there is nothing to take over.
-    ``began`` and ``until`` are on the observer's clock; ``seconds`` and ``to`` (a uuid) are None and empty until
-    another device executes the task.
+    ``task`` is the id of the task that the device executed.  It is empty if the device executed no task; then there is
+    nothing to take over.  ``began`` and ``until`` are times on the observer's clock.  When another device executes the
+    task, ``seconds`` is the duration of the takeover and ``to`` the uuid of that device; until then they are None and
+    empty.
     """
 
     lost: str
@@ -35,7 +36,7 @@ class Takeover:
     to: str = ""
 
     def observe(self, acts: Mapping[str, str], now: float) -> bool:
-        """Record the executing devices (uuid to task) at ``now``; returns True if this call detects the takeover."""
+        """Record the executing devices (uuid to task) at ``now``; return True if this call detects the takeover."""
         if not self.is_open(now):
             return False
         others = sorted(uuid for uuid, task in acts.items() if task == self.task and uuid != self.lost)

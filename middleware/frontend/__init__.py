@@ -1,1 +1,1 @@
-"""The team for user interfaces: a view of its records, and a client for requests and orders."""
+"""Access to the team for user interfaces: a view of its records, and a client for requests and orders."""

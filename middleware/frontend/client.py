@@ -1,4 +1,4 @@
-"""The requests of a user interface through one node (thesis, Algorithm 4.4)."""
+"""The requests that a user interface makes through one node (thesis, Algorithm 4.4)."""
 
 from __future__ import annotations
 
@@ -25,9 +25,10 @@ LOOKUP_S = 1.0
 
 
 class TeamClient:
-    """Watches the team over ``node``, calls its devices, and orders tasks.
+    """Watches the team through ``node``, calls devices, and orders tasks.
 
-    ``view`` shows the watched records, ``version`` counts their changes, and ``clock`` is the node's.
+    ``view`` decodes the watched records, ``version`` is the number of their changes, and ``clock`` is the clock of the
+    node.
     """
 
     def __init__(self, node: SwarmNode) -> None:
@@ -46,7 +47,7 @@ class TeamClient:
         return self._node.presence.device.name
 
     def read(self, key: bytes) -> list[Record]:
-        """Return the watched records under ``key``: of devices, tasks, stops, and each task's group and verdicts."""
+        """Return the watched records under ``key``: devices, tasks, stops, or a task's group or decision records."""
         if key == DEVICES:
             return self._devices.records
         if key == TASKS:
@@ -59,15 +60,15 @@ class TeamClient:
     # -- devices ----------------------------------------------------------------------------------------------------
 
     def find_contact(self, uuid: str) -> Contact | None:
-        """Return the contact of a device that is present, or None."""
+        """Return the contact of a device, or None if it is not present."""
         record = self.view.find_record(uuid)
         return None if record is None else self._node.find_contact(record)
 
     def call(self, uuid: str, method: str, *arguments: object, timeout: float, changes: bool = False) -> Deferred[Any]:
-        """Call a method of a device; fails with ``EntangledError``, and with ``NoAnswer`` if it is not present.
+        """Call a method of a device; fail with ``EntangledError``, or ``NoAnswer`` if the device is not present.
 
         :param timeout: seconds
-        :param changes: whether the call changes something, so that it may run only once
+        :param changes: whether the call changes something, so that it must not be executed twice
         """
         contact = self.find_contact(uuid)
         if contact is None:
@@ -81,11 +82,11 @@ class TeamClient:
     # -- stops ------------------------------------------------------------------------------------------------------
 
     def stop_all(self, by: str) -> Deferred[dict[str, str]]:
-        """Stop every device; fires with the answer of each by uuid."""
+        """Stop every device; fire with the answer of each device by uuid."""
         return self._node.stop_state.stop(by, self._contacts())
 
     def release(self, stops: Iterable[bytes], by: str) -> Deferred[dict[str, str]]:
-        """Release ``stops``; fires with the answer of each device by uuid."""
+        """Release ``stops``; fire with the answer of each device by uuid."""
         return self._node.stop_state.release(list(stops), by, self._contacts())
 
     # -- tasks ------------------------------------------------------------------------------------------------------
@@ -95,10 +96,10 @@ class TeamClient:
         return self._node.rng.randbytes(6).hex()
 
     def find_task(self, task_id: str) -> Deferred[Task | None]:
-        """Fire with the task of that id, or None.
+        """Fire with the task that has that id, or None.
 
-        The team is queried, because another node's last write may not have been replicated to this one; if no answer
-        arrives within ``LOOKUP_S``, the locally watched records are used.
+        The team is queried, because a task that another node has just published may not have been pushed to this node
+        yet. If no answer arrives within ``LOOKUP_S``, the locally watched records are used.
         """
         found: Deferred[Task | None] = Deferred()
 
@@ -114,12 +115,12 @@ class TeamClient:
         return found
 
     def submit(self, template: Task, task_id: str) -> tuple[Task, Deferred[Any]]:
-        """Publish a task now; return it, and a Deferred that fires when it is stored."""
+        """Publish a task now; return the task, and a Deferred that fires when the task is stored."""
         task = replace(template, task_id=task_id, created=self._node.wall())
         return task, Deferred.fromCoroutine(self._node.submit(task))
 
     def cancel(self, task_id: str) -> Deferred[Any]:
-        """Record that the task is cancelled; its agents stop."""
+        """Record that the task is cancelled, so its agents stop."""
         result = Result(CANCELLED, self.name)
         task = self.view.find_task(task_id)
         if task is None:

@@ -25,15 +25,16 @@ from middleware.tasks.task import (
 from middleware.tasks.task import parse_tasks as tasks_in
 
 Read = Callable[[bytes], list[Record]]
-"""Return the records under a key: of a store, or of watches."""
+"""Returns the records under a key, from a store or from watches."""
 
 
 @dataclass(frozen=True)
 class Progress:
     """The state of one task.
 
-    ``members`` are the agents that reported to it, ``outcome`` is its result (None while it is open), ``paused_by`` the
-    device whose operator paused it ("" for none), and ``council`` the addresses of the acceptors of its lease.
+    ``members`` are the reports of its agents, and ``outcome`` is its result (None if it has not ended).  ``paused_by``
+    is the device whose operator paused the task ("" if it is not paused).  ``council`` contains the addresses of the
+    acceptors of its lease.
     """
 
     members: tuple[Member, ...]
@@ -43,14 +44,14 @@ class Progress:
 
 
 class TeamView:
-    """The team in the records that ``read`` returns; each property reads them again."""
+    """The team as described by the records from ``read``; each property reads the records again."""
 
     def __init__(self, read: Read) -> None:
         self._read = read
 
     @property
     def devices(self) -> list[Device]:
-        """The devices that are present, in the order of joining."""
+        """The present devices, in the order of joining."""
         return [device for device, _ in parse_devices(self._read(DEVICES))]
 
     @property
@@ -65,7 +66,7 @@ class TeamView:
 
     @property
     def stops(self) -> dict[str, str]:
-        """The stops of the team in force: the id in hex, and the operator."""
+        """The stops in force: the id in hex, and the operator."""
         return {stop.hex(): by for stop, by in collect_stops(self._read(STOPS_KEY)).items()}
 
     def find_task(self, task_id: str) -> Task | None:
@@ -73,7 +74,7 @@ class TeamView:
         return tasks_in(self._read(TASKS)).get(task_id)
 
     def list_members(self, task_id: str) -> list[Member]:
-        """Return the agents that reported to a task."""
+        """Return the reports of a task's agents."""
         return [member for record in self._read(group_key(task_id)) if (member := parse_member(record)) is not None]
 
     def find_progress(self, task: Task) -> Progress:
@@ -89,7 +90,7 @@ class TeamView:
         )
 
     def explain(self, task_id: str) -> Explanation:
-        """Explain the choice of the task's agent by the verdicts of the agents."""
+        """Explain the choice of the task's agent from the decision records of the agents."""
         records = [
             decision
             for record in self._read(decision_records_key(task_id))
@@ -98,14 +99,14 @@ class TeamView:
         return explain_decisions(decision for decision in records if decision.task == task_id)
 
     def find_unable_devices(self, task: Task) -> dict[str, list[str]]:
-        """Return the unmet requirements of ``task`` by the name of each device that cannot do it (Algorithm 4.4)."""
+        """Return the unmet requirements of ``task``, by the name of the device that lacks them (Algorithm 4.4)."""
         reasons = {
             device.name: find_unmet_requirements(device.capabilities, task.requirements) for device in self.devices
         }
         return {name: unmet for name, unmet in reasons.items() if unmet}
 
     def find_device(self, uuid: str) -> Device | None:
-        """Return a device that is present, or None."""
+        """Return a device, or None if it is not present."""
         return next((device for device in self.devices if device.uuid == uuid), None)
 
     def find_name(self, uuid: str) -> str:
@@ -114,5 +115,5 @@ class TeamView:
         return uuid[:8] if device is None else device.name
 
     def find_record(self, uuid: str) -> Record | None:
-        """Return the record of a device that is present, or None."""
+        """Return the record of a device, or None if it is not present."""
         return next((record for device, record in parse_devices(self._read(DEVICES)) if device.uuid == uuid), None)

@@ -1,13 +1,13 @@
 """The stops that a node knows, and the releases that ended some of them.  Pure.
 
-A stop has a random id, and a release names the ids of the stops that it ends.  The team is stopped while any stop is
-not released.  Stops and releases are merged as in a two-phase set: the order and repetition of messages make no
-difference, and a released stop does not return.  Stops have no priority, so a sender cannot disable later stops by a
-high number.
+A *stop* is one emergency stop order, with a random id; a *release* contains the ids of the stops that it ends.  A stop
+is in force until it is released, and the team is stopped as long as any stop is in force.  Stops and releases are
+merged as in a two-phase set: the order and repetition of messages make no difference, and a released stop never comes
+into force again.  Stops are not numbered, so a sender cannot make later stops ineffective with a high number.
 
-Each sender has its own entries, so it cannot displace another sender's stops.  If a table is full, the team is stopped
-for longer, never for less: the two oldest stops of a sender are merged into one with a new id, which must be released;
-of the releases the oldest is removed, and its stop may have to be released again.
+Each sender has separate entries, so it cannot displace another sender's stops.  A full table can only make the team
+stop for longer.  If a sender has too many stops, its two oldest are merged into one with a new id, which must be
+released.  If there are too many releases, the oldest is removed, and its stop may have to be released again.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ MAX_RELEASED = 512
 MAX_OPERATOR_CHARACTERS = 64
 """Maximum characters of the operator's name."""
 MAX_OPERATOR_BYTES = 48
-"""Maximum bytes of that name in messages: eight stops fit into a record that every device holds."""
+"""Maximum bytes of that name in messages, so that eight stops fit into one record, which every device stores."""
 _SHARED = b""
 """The sender for the stops of senders beyond ``MAX_SENDERS``."""
 
 
 @dataclass(frozen=True)
 class Statement:
-    """The orders of one sender: its stops in force (id to operator), and the stops that it released.
+    """The orders of one sender: its stops in force (id to operator), and the ids of the stops that it released.
 
     ``by`` is the operator of the newest order.
     """
@@ -50,12 +50,12 @@ class Statement:
     by: str = ""
 
     def pack(self) -> list[object]:
-        """Return the arguments of ``device.halt``, which are also the value of the record."""
+        """Return the arguments of ``device.halt``; packed, they are also the value of the sender's record."""
         return [[[stop, by] for stop, by in self.stops.items()], list(self.released), self.by]
 
 
 class StopSet:
-    """The stops by sender (a public key), and the released ids; the newest are last."""
+    """The stops of each sender (a public key), and the ids of the released stops, each with the newest last."""
 
     def __init__(self) -> None:
         self._stops: dict[bytes, dict[bytes, str]] = {}
@@ -63,7 +63,7 @@ class StopSet:
 
     @property
     def in_force(self) -> dict[bytes, str]:
-        """The stops that are not released, id to operator; empty if the team is not stopped."""
+        """The stops that are not released (id to operator); empty if the team is not stopped."""
         return {stop: by for stops in self._stops.values() for stop, by in stops.items()}
 
     def get_stops(self, sender: bytes) -> dict[bytes, str]:
@@ -71,7 +71,7 @@ class StopSet:
         return dict(self._stops.get(sender, {}))
 
     def merge(self, sender: bytes, statement: Statement, may_release: bool = True) -> bool:
-        """Merge an order of ``sender``, its releases only if ``may_release``; returns whether anything is new."""
+        """Merge the orders of ``sender``, its releases only if ``may_release``; return whether anything is new."""
         is_new = False
         for stop in statement.released if may_release else ():
             is_new |= self._release(stop)
@@ -111,7 +111,7 @@ class StopSet:
 
 
 def derive_id(*parts: bytes) -> bytes:
-    """Return the id of a stop without a random id."""
+    """Return the id of a stop that has no random id, derived from ``parts``."""
     return hashlib.blake2s(b"".join(parts), digest_size=ID_BYTES, person=b"stop").digest()
 
 
@@ -132,10 +132,10 @@ def parse_statement(fields: object) -> Statement | None:
 
 
 def parse_record_value(owner: bytes, value: bytes | None) -> Statement | None:
-    """Decode the statement in a record of ``owner``; None if there is none.  Never raises.
+    """Decode the statement in a record of ``owner``; None if ``value`` has no valid statement.  Never raises.
 
-    Earlier versions wrote ``[number, is on, by]``.  If "is on" is true, it counts as a stop, which must be released by
-    its id; otherwise it has no effect.
+    Earlier versions wrote ``[number, is on, by]``.  If "is on" is true, such a value is treated as a stop, which must
+    be released by its derived id; otherwise the value has no effect.
     """
     try:
         fields: Any = msgpack.unpackb(value or b"")
@@ -154,16 +154,16 @@ def parse_record_value(owner: bytes, value: bytes | None) -> Statement | None:
 
 
 def parse_stop_set(fields: object) -> StopSet:
-    """Decode a set from the store; raises ``ValueError`` if it is malformed."""
+    """Decode a stop set from the store; raise ``ValueError`` if it is malformed."""
     stops, released = fields if isinstance(fields, list) and len(fields) == 2 else (None, None)
     found = StopSet()
     if not isinstance(stops, list) or len(stops) > MAX_SENDERS + 1 or not _are_ids(released):
-        raise ValueError("malformed set of stops")
+        raise ValueError("the stored set of stops is malformed")
     for entry in stops:
         sender, listed = entry if isinstance(entry, list) and len(entry) == 2 else (None, None)
         of_sender = _parse_stops(listed, MAX_STOPS_OF_SENDER)
         if not isinstance(sender, bytes) or not of_sender:
-            raise ValueError("malformed stops of a sender")
+            raise ValueError("the stored stops of a sender are malformed")
         found._stops[sender] = of_sender
     found._released = dict.fromkeys(released or ())
     return found

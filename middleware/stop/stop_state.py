@@ -1,12 +1,13 @@
-"""The stops of the whole team as this node knows them; agents obey them.
+"""The emergency stops of the whole team that this node knows; its agent obeys them.
 
-A stop is sent to every device at once, and stays as a record for devices that join later or did not receive it.  It is
-in force until a release names it (``middleware.stop.stop_set``).  Stops and releases are accepted only from members
-that may order.  If the role of a record's owner is unknown, its stops are accepted and its releases are not.
+A stop is sent to every device directly, and is also written as a record for devices that join later or did not receive
+it.  It is in force until a release contains its id (``middleware.stop.stop_set``).  Stops and releases are accepted
+only from members with the permission to give orders.  If the role of a record's owner is unknown, the record's stops
+are accepted, but not its releases.
 
-A node keeps the stops in its store and acknowledges a stop after it is written, so that a restart releases nothing.  If
-no record names a stop any longer, because its author left or was revoked, a node that may order adds it to its own
-record.
+A node writes a stop to its store before it acknowledges the stop, so a restart does not release it.  If the author of a
+stop has left or was revoked, no record may contain the stop any longer; then a node with the permission to give orders
+adds the stop to its own record.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ STOPS_KEY = hash_key("halt")
 SLOT = "halt"
 METHOD = "device.halt"
 NOTE_NAME = "halt/stops"
-"""The key in the node's store of the stops in force, the released ones, and the releases of this node."""
+"""The key in the node's store for the stops in force, the released stops, and the releases that this node ordered."""
 STANDS_STILL = "stands"
 CONTINUES = "goes on"
 NO_ROBOT = "has no robot"
@@ -51,23 +52,23 @@ NOT_SAVED = "; it cannot save the stop: a restart of its node may end it"
 RECORDED_RELEASES = 16
 """Maximum number of releases in the node's own record; the newest are kept."""
 MAX_OWN_STOPS = MAX_ADOPTED_STOPS = MAX_STOPS // 2
-"""Maximum number of a node's own stops in force (a new one replaces the oldest), and of adopted stops."""
+"""Maximum number of a node's own stops in force, and of adopted stops; a further own stop replaces the oldest."""
 REVIEW_INTERVAL_S = 10.0
 """Minimum seconds between two checks for stops without a record while the team is stopped.
 
-The maximum is twice that.
+The maximum is twice this value.
 """
 
 Report = Callable[[Collection[bytes], str], None]
-"""Called with the stops that are obeyed, and with a short text about the node's activity."""
+"""Called with the ids of the stops that the node obeys, and a short text about its activity."""
 Later = Callable[[float, Callable[[], None]], object]
 
 
 class StopState:
-    """The stops as this node knows them; agents check ``is_motion_forbidden`` before they act, and report activity.
+    """The stops that this node knows; agents check ``is_motion_forbidden`` before they act, and report their activity.
 
-    ``later(seconds, call)`` is a timer that ends with the node, and ``report`` is called after each change.  Without a
-    node, nothing is stopped.
+    ``later(seconds, call)`` calls ``call`` after ``seconds``, unless the node is stopped first; ``report`` is called
+    after each change.  If ``entangled`` is None, no stop is ever in force.
     """
 
     def __init__(
@@ -96,7 +97,7 @@ class StopState:
 
     @property
     def stops(self) -> Mapping[bytes, str]:
-        """The stops in force, id to operator."""
+        """The stops in force (id to operator)."""
         return self._stop_set.in_force
 
     @property
@@ -111,26 +112,29 @@ class StopState:
 
     @property
     def operators(self) -> str:
-        """The operators of the stops in force."""
+        """The names of the operators that ordered the stops in force."""
         return ", ".join(dict.fromkeys(filter(None, self._stop_set.in_force.values())))
 
     @property
     def records(self) -> list[Record]:
-        """The records of the stops, if they are followed."""
+        """The watched records of the stops; empty before ``follow``."""
         return [] if self._watch is None else self._watch.records
 
     def subscribe(self, obey: Callable[[], str]) -> None:
-        """Call ``obey`` when the team is stopped or released; it returns a short text about its activity."""
+        """Call ``obey`` when the team is stopped or released; it must return the agent's activity as a short text."""
         self._listeners.append(obey)
 
     def follow(self) -> None:
-        """Follow the records of the stops; they are also kept in the node's store."""
+        """Watch the records of the stops, and keep them in the node's store."""
         if self._entangled is not None and self._watch is None:
             self._watch = self._entangled.watch(STOPS_KEY, self._merge_records, keep=True)
             self._review_later()
 
     def request_stops(self) -> None:
-        """Follow the stops, and stand still until the network has returned them; call it again until then."""
+        """Watch the stops, and forbid motion until the network has returned them.
+
+        Agents repeat this call until then.
+        """
         if self._entangled is None or self._is_requesting or (self._watch is not None and self.is_known):
             return
         self.follow()
@@ -138,7 +142,7 @@ class StopState:
         self._entangled.get(STOPS_KEY).addCallbacks(self._on_records, self._ignore_unreachable)
 
     def recheck(self) -> str:
-        """Check doubtful records again, and obey; returns a short text about the node's activity."""
+        """Check again the records whose releases were not accepted, and obey; return the activity as a short text."""
         if self._has_doubtful:
             self._merge_records(self.records)
         return self._notify()
@@ -146,7 +150,7 @@ class StopState:
     # -- orders of this node's operator -----------------------------------------------------------------------------
 
     def stop(self, by: str, contacts: Collection[Contact]) -> Deferred[dict[str, str]]:
-        """Stop the team; fires with the activity of each of ``contacts`` as a short text, by uuid."""
+        """Stop the team; fire with a short text about the activity of each of ``contacts``, by uuid."""
         assert self._entangled is not None and self._rng is not None
         # Use a new id each time, so that a late release of an earlier stop does not end this one.
         stop = self._rng.randbytes(ID_BYTES)
@@ -155,7 +159,7 @@ class StopState:
         return self._order(Statement({stop: clip_name(by)}, tuple(replaced), clip_name(by)), contacts)
 
     def release(self, stops: Iterable[bytes], by: str, contacts: Collection[Contact]) -> Deferred[dict[str, str]]:
-        """Release these stops only; fires as ``stop`` does.  Raises ``ValueError`` for an invalid id."""
+        """Release only these stops; fire as ``stop`` does.  Raise ``ValueError`` for an invalid id."""
         named = tuple(dict.fromkeys(stops))[:MAX_RELEASED]
         if not are_ids(named):
             raise ValueError(f"the id of a stop must have {ID_BYTES} bytes")
@@ -192,7 +196,7 @@ class StopState:
     # -- orders of other nodes --------------------------------------------------------------------------------------
 
     def answer(self, peer: Contact, stops: list[object], released: list[object], by: str) -> Deferred[list[object]]:
-        """Obey a peer's order; fires with the node's activity and the obeyed stops once they are stored."""
+        """Obey a peer's order; when it is stored, fire with the node's activity and the stops that the node obeys."""
         statement = parse_statement([stops, released, by])
         if statement is None:
             raise Refused(
@@ -213,7 +217,7 @@ class StopState:
         return self._entangled.store.wait_for_write().addCallbacks(saved, unsaved)
 
     def apply_order(self, sender: bytes, statement: Statement) -> str:
-        """Merge an order of ``sender``, which may order; returns a short text about the node's activity."""
+        """Merge an order of ``sender``, a node that may give orders; return the activity as a short text."""
         return self._apply(self._merge(sender, statement, may_release=True))
 
     def _merge(self, sender: bytes, statement: Statement, may_release: bool) -> bool:
@@ -246,7 +250,7 @@ class StopState:
         self._notify()
 
     def _ignore_unreachable(self, failure: Any) -> None:
-        """Ignore that no node answered; agents call ``request_stops`` again."""
+        """Ignore an unanswered request; agents call ``request_stops`` again."""
         failure.trap(EntangledError)
         self._is_requesting = False
 
@@ -271,7 +275,7 @@ class StopState:
             self._entangled.store.set_note(NOTE_NAME, msgpack.packb([*self._stop_set.pack(), list(self._own_releases)]))
 
     def _restore(self, entangled: EntangledNode) -> None:
-        """Load the stops of an earlier run; an unreadable entry counts as a stop until it is released."""
+        """Load the stops of an earlier run; an unreadable entry is treated as a stop until it is released."""
         own, note = entangled.identity.public, entangled.store.get_note(NOTE_NAME)
         if note is not None:
             try:
@@ -310,7 +314,7 @@ class StopState:
             self._later(REVIEW_INTERVAL_S * (1.0 + self._rng.random()), self._review)
 
     def _review(self) -> None:
-        """Adopt stops that no record names any longer, if this node may, and check again later."""
+        """Adopt stops that are no longer in any record, if this node may give orders, and check again later."""
         self._is_reviewing = False
         self._adopt()
         self._publish()
@@ -333,14 +337,14 @@ class StopState:
 
 
 def expose_stops(entangled: EntangledNode, rng: random.Random, later: Later, report: Report) -> StopState:
-    """Create the stops of the node ``entangled`` and let peers order stops and releases."""
+    """Create the stop state of the node ``entangled``, and let peers order stops and releases."""
     stop_state = StopState(entangled, rng, later, report)
     entangled.endpoint.expose(METHOD, stop_state.answer, changes=True, idempotent=True)
     return stop_state
 
 
 def collect_stops(records: list[Record]) -> dict[bytes, str]:
-    """Return the stops in force by these records alone, id to operator."""
+    """Return the stops that are in force according to these records alone (id to operator)."""
     found = StopSet()
     for record in records:
         statement = parse_record_value(record.owner, record.value) if record.name == SLOT else None
@@ -350,5 +354,5 @@ def collect_stops(records: list[Record]) -> dict[bytes, str]:
 
 
 def _ignore_unwritten(failure: Any) -> None:
-    """Ignore that too few replicas are reachable: the owner writes the record again when they are."""
+    """Ignore an error for too few reachable replicas: the owner writes the record again when enough are reachable."""
     failure.trap(EntangledError)

@@ -1,4 +1,4 @@
-"""The quorum members of tasks: chooses and replaces them, and creates their clients and this node's acceptor."""
+"""Choose and replace the quorum members of tasks, and create this node's acceptor and its lease clients."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from middleware.entangled.record import Slot
 from middleware.tasks.task import TASKS, Task, group_key
 
 LARGE_TEAM_CONTACTS = 50
-"""Number of contacts from which a task has five quorum members instead of three."""
+"""Minimum number of contacts with which a task has five quorum members instead of three."""
 SILENT_S = 10.0
 """Seconds without an answer after which a quorum member is replaced."""
 
 
 class CouncilManager:
-    """The quorum members of tasks, reached through ``entangled``.
+    """Chooses the quorum members of tasks; its requests are sent through ``entangled``.
 
     ``born_at`` is the time at which the node started.  ``on_change`` is called with a task whose quorum members have
     changed.  ``may_be_member`` returns whether the owner of a key may be a quorum member.
@@ -56,9 +56,9 @@ class CouncilManager:
         )
 
     async def choose_council(self, task: Task) -> Task:
-        """Return a new ``task`` with its quorum members, which this node signs.
+        """Return a new ``task`` with its quorum members, signed by this node.
 
-        They are the nodes closest to its key now (consensus rule 1).
+        The members are the nodes that are now closest to the task's group key.
         """
         key = group_key(task.task_id)
         found = await self._entangled.find_node(key)
@@ -68,7 +68,7 @@ class CouncilManager:
         return replace(task, council=members, charter=charter.packed)
 
     def make_proposer(self, task: Task, floor: int = 0) -> LeaseProposer:
-        """Return a client for the quorum members of ``task``; its tokens are above ``floor``."""
+        """Return a proposer for the lease of ``task``; its fencing tokens are above ``floor``."""
         ttl = float(task.lease_ttl)
 
         def ask(member: Contact, method: str, arguments: tuple[Any, ...]) -> Deferred[Any]:
@@ -85,19 +85,19 @@ class CouncilManager:
         return proposer
 
     def make_lease_client(self, task: Task, changed: Callable[[], None], floor: int) -> LeaseClient:
-        """Create this node's lease client for ``task``, with tokens above ``floor``."""
+        """Create this node's lease client for ``task``; its fencing tokens are above ``floor``."""
         client = LeaseClient(self.make_proposer(task, floor), self._clock, self._rng, changed, task.stop_time)
         self.lease_service.register(client)
         return client
 
     def has_vacancy(self, task: Task, proposer: LeaseProposer) -> bool:
-        """Return whether a quorum member is silent, or there were too few nodes when they were chosen."""
+        """Return whether a quorum member is silent, or there are fewer members than the task should have."""
         return 0 < len(proposer.members) < self._choose_size(task) or bool(proposer.find_silent_members(SILENT_S))
 
     async def find_successors(self, task: Task, proposer: LeaseProposer) -> tuple[Contact, ...] | None:
-        """Return the next quorum members of ``task``: the present ones that answer, and the closest other nodes.
+        """Return the next quorum members of ``task``: the present members that answer, and the closest other nodes.
 
-        None if that would be no improvement.  Fails with ``EntangledError`` if no node answers.
+        None if that would not be an improvement.  Raises ``EntangledError`` if no node answers.
         """
         key, silent = group_key(task.task_id), proposer.find_silent_members(SILENT_S)
         silent_ids = {member.node_id for member in silent}
@@ -117,10 +117,11 @@ class CouncilManager:
 def choose_successors(
     members: Sequence[Contact], silent: Sequence[Contact], candidates: Sequence[Contact], size: int
 ) -> tuple[Contact, ...] | None:
-    """Return the quorum members that should follow ``members``, of which some are ``silent``; None for no change.
+    """Return the quorum members that should replace ``members``, of which some are ``silent``; None for no change.
 
-    Members that answer remain; ``candidates`` fill the other places in order, up to ``size``.  A change must increase
-    the number of answering members that may be lost: three instead of two, but never four instead of three.
+    Members that answer remain; ``candidates`` are added in order, up to ``size``.  There is a change only if it
+    increases the number of answering members that may be lost: three members instead of two are an improvement, four
+    instead of three are not.
     """
     silent_ids, member_ids = {member.node_id for member in silent}, {member.node_id for member in members}
     responding = [member for member in members if member.node_id not in silent_ids]
@@ -135,10 +136,10 @@ def choose_successors(
 
 
 def take_odd_number(members: Sequence[Contact]) -> tuple[Contact, ...]:
-    """Return the first ``members``, an odd number of them: four tolerate no more failures than three."""
+    """Return the largest odd number of the first ``members``, because four tolerate no more failures than three."""
     return tuple(members[: len(members) - 1 + len(members) % 2])
 
 
 def _count_tolerated_losses(responding: int, size: int) -> int:
-    """Return the number of members ``responding`` that may be lost while the rest is a majority of ``size``."""
+    """Return how many of the ``responding`` members may be lost so that a majority of ``size`` remains."""
     return responding - majority(size)

@@ -1,4 +1,4 @@
-"""An operator's order about a task, pause or resume, in a separate slot under the task's group key."""
+"""An operator's order to pause or resume a task, in a separate slot under the task's group key."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ORDERS = (PAUSE, RESUME)
 
 @dataclass(frozen=True)
 class Order:
-    """One order, which is one of ``ORDERS``; the newest is valid, by ``at`` (unix seconds on the writer's clock)."""
+    """One order; ``word`` is one of ``ORDERS``, and ``at`` is in Unix seconds on the writer's clock."""
 
     word: str
     by: str
@@ -28,7 +28,7 @@ class Order:
 
 
 def find_newest_order(records: list[Record]) -> Order | None:
-    """Return the newest order in the records of a group, or None; equal records give the same order at every node."""
+    """Return the newest order in the records of a group, or None; every node with these records gets the same order."""
     orders = [order for record in records if (order := _parse_order(record)) is not None]
     return max(orders, key=lambda order: (order.at, order.word, order.by), default=None)
 

@@ -2,8 +2,9 @@
 
 A task is a team record under one key, written once by the node that submits it.  Each participant writes its own slot
 under the task's group key, and the outcome is another team record there, so no record is ever changed by two nodes.
-Records of nodes that may not order tasks have a proof: new quorum members (``COUNCIL``) the signatures of the previous
-members, and the end of a task (``DONE``) the signatures of the members that granted the lease.
+Two kinds of records can be written by nodes that may not order tasks; these contain a proof.  A record of new quorum
+members (``COUNCIL``) contains the signatures of the previous members, and a record of the end of a task (``DONE``) the
+signatures of the members that granted the lease.
 """
 
 from __future__ import annotations
@@ -49,29 +50,29 @@ MAX_WEIGHT = 1e9
 
 
 def group_key(task_id: str) -> bytes:
-    """Return the key under which the participants of a task report."""
+    """Return the key under which the participants of a task write their reports."""
     return hash_key(f"task/{task_id}")
 
 
 @dataclass(frozen=True)
 class Task:
-    """A task for one device (``exclusive``), decided by ``strategy``.
+    """A task; ``strategy`` chooses its agent.
 
-    - ``requirements``: capability names and the minimum properties that a device must have
-    - ``waiting_period``: seconds for which agents wait for each other's reports after the first one
+    - ``requirements``: the capabilities that a device must have, by name, with the minimum values of their properties
+    - ``waiting_period``: seconds after the first report for which agents wait for more reports
     - ``lease_ttl``: seconds after which the lease of a silent holder expires
-    - ``hysteresis``: the share by which a report must be better than the acting agent's to take over the task
+    - ``hysteresis``: the share by which a report must be better than that of the acting agent to take over the task
     - ``council``: the quorum members that grant the lease, fixed when the task is published; if the team is large
-      enough, ``tolerates`` of them may fail at once
-    - ``configuration``: the number of the quorum members' configuration
-    - ``charter``: the proof of the members and their number (``middleware.consensus.lease.charter``)
-    - ``priority``: an agent's robot serves the task with the highest priority first, then the oldest
-    - ``preemptible``: the task is interrupted for one of higher priority, and resumed
-    - ``deadline``: seconds after its creation
+      enough, ``tolerates`` of them may fail at the same time
+    - ``configuration``: the number of the configuration, which increases with each change of the quorum members
+    - ``charter``: the proof of the quorum members and of ``configuration`` (``middleware.consensus.lease.charter``)
+    - ``priority``: a robot serves the task with the highest priority first; of equal priorities, the oldest task
+    - ``preemptible``: a task of higher priority interrupts this task, which is resumed afterwards
+    - ``deadline``: seconds after the task's creation (0: none)
     - ``stall_limit``: seconds without progress after which the lease is released (0: none)
     - ``stop_time``: seconds that the robot needs to stop
-    - ``value``: the value of the task
-    - ``generation``: increases when an operator creates the task again
+    - ``value``: the value of the task, which strategies can compare with that of other tasks
+    - ``generation``: a number that increases when an operator creates the task again
     - ``group``: tasks of one group are assigned together
     """
 
@@ -104,7 +105,7 @@ class Task:
         return replace(self, council=charter.members, configuration=charter.configuration, charter=charter.packed)
 
     def with_newer_council(self, other: Task) -> Task:
-        """Return this task with the quorum members of ``other``, if these are newer."""
+        """Return this task with the quorum members of ``other`` if those are newer than its own."""
         own, newer = parse_charter(self.charter), parse_charter(other.charter)
         is_newer = (
             own is not None
@@ -115,7 +116,7 @@ class Task:
         return self.with_council(newer) if is_newer and newer is not None else self
 
     def pack(self) -> bytes:
-        """Return the value of the task's record, without default values and fields that the charter has."""
+        """Return the value of the task's record; fields with default values, or in the charter, are omitted."""
         content = _non_default_fields(self)
         if self.charter:
             content.pop("council", None)
@@ -129,20 +130,21 @@ class Task:
 class Member:
     """One participant's report to the others, in its slot under the group key.
 
-    - ``cost``: the measured distance in metres, or None if there is nothing to report
+    - ``cost``: the measured distance in metres, or None if nothing was measured
     - ``assigned``: the uuid of the agent that the participant's decision assigned; ``digest``: the digest of the
       reports used
-    - ``epoch``: the round of the task that report and decision belong to; ``serial``: the number of the report in that
-      round.  Older reports than the newest known are ignored.
-    - ``valid_for``: seconds for which the report is valid (0: while its writer is present); ``age``: the seconds that
-      had passed when it was written
+    - ``epoch``: the round of the task to which the report and the decision belong; ``serial``: the number of the report
+      in that round.  Reports older than the newest known report are ignored.
+    - ``valid_for``: seconds for which the report is valid (0: as long as its writer is present); ``age``: the seconds
+      that had already passed when the record was written
     - ``available``: whether the robot is free for this task; ``load``: the participant's number of tasks
     - ``state``: the agent's state (``agents.state``); ``progress``: the share of the task that is done, 0 to 1
-    - ``angle``: its direction as seen from the target; ``post``: the direction it moves to; in radians by the compass
+    - ``angle``: the robot's direction as seen from the target; ``post``: the direction to which the robot moves; both
+      in radians by the compass
 
-    Fields that only some strategies read: ``battery`` is the charge left, 0 to 1; ``value`` a number or a place to
-    agree on, in metres; ``choice`` a vote; ``weight`` the weight of both; and ``electorate`` the total weight of all
-    that may vote.
+    Fields that only some strategies read: ``battery`` is the remaining charge, 0 to 1.  ``value`` is a number to agree
+    on, or coordinates in metres; ``choice`` is a vote; ``weight`` is the weight of ``value`` and ``choice``.
+    ``electorate`` is the total weight of all agents that may vote.
     """
 
     uuid: str
@@ -178,7 +180,7 @@ class Member:
 class Result:
     """The outcome of a task, one of ``OUTCOMES``, and ``why``, a reason for display.
 
-    ``bids`` are the reports of the decision, (name, metres) each.
+    ``bids`` are the reports that the decision used, each (name, metres).
     """
 
     outcome: str
@@ -194,12 +196,12 @@ class Result:
 
     @property
     def rank(self) -> tuple[int, str, str]:
-        """The sort key: of several results the one with the highest key is valid at every node."""
+        """The sort key: if a task has several results, every node uses the result with the highest key."""
         return self.token, self.outcome, self.by
 
 
 def find_unmet_requirements(capabilities: Capabilities, requirements: Capabilities) -> list[str]:
-    """Return the requirements that ``capabilities`` do not meet, as text; empty if all are met (Algorithm 4.4)."""
+    """Return each requirement that ``capabilities`` do not meet, as text (Algorithm 4.4)."""
     reasons = []
     for name, properties in requirements.items():
         if name not in capabilities:
@@ -256,7 +258,7 @@ def parse_task(record: Record) -> Task | None:
 def parse_tasks(records: Iterable[Record]) -> dict[str, Task]:
     """Decode the tasks in ``records``, by id.
 
-    Each change of quorum members adds a record; the one with the newest members is used.
+    Each change of quorum members adds a record of the same task; the record with the newest members is used.
     """
     known = [(task, record.owner) for record in records if (task := parse_task(record)) is not None]
     known.sort(key=lambda pair: (pair[0].generation, pair[0].configuration, pair[0].created, pair[1]))
@@ -295,7 +297,7 @@ def parse_member(record: Record) -> Member | None:
         and is_weight(member.electorate)
     )
     if not is_valid or derive_node_id(record.owner).hex() != member.uuid:
-        return None  # no node reports for another
+        return None  # a node may report only for itself
     return member if is_bid(member.cost) and not is_stale(member, 0.0) else replace(member, cost=None)
 
 
@@ -305,7 +307,7 @@ def is_bid(cost: object) -> bool:
 
 
 def is_value(value: object) -> bool:
-    """Return whether ``value`` is a number or a place to agree on: a tuple of numbers within ``MAX_WEIGHT``."""
+    """Return whether ``value`` is a valid number or place to agree on: a tuple of numbers within ``MAX_WEIGHT``."""
     return (
         isinstance(value, tuple)
         and len(value) <= MAX_COORDINATES
@@ -314,12 +316,12 @@ def is_value(value: object) -> bool:
 
 
 def is_choice(choice: object) -> bool:
-    """Return whether ``choice`` is a printable option, or "" for none."""
+    """Return whether ``choice`` is a valid vote: a short printable text, empty for no vote."""
     return isinstance(choice, str) and len(choice) <= MAX_CHOICE_CHARACTERS and choice.isprintable()
 
 
 def is_weight(weight: object) -> bool:
-    """Return whether ``weight`` is a valid weight of a vote or value."""
+    """Return whether ``weight`` is valid as the weight of a vote or value."""
     return is_number(weight) and 0.0 <= weight <= MAX_WEIGHT  # type: ignore[operator]
 
 
@@ -351,15 +353,15 @@ def parse_result(record: Record, most: int = MAX_VALUE_BYTES) -> Result | None:
 
 
 def pack_done(result: Result, proof: bytes) -> bytes:
-    """Return the value of the record with which an agent reports the end of its task, with the proof of its lease."""
+    """Return the value of an agent's record of the end of its task; ``proof`` is the proof of its lease."""
     return bytes(msgpack.packb({**vars(result), "proof": proof}))
 
 
 def find_outcome(task: Task, records: Iterable[Record]) -> Result | None:
-    """Return the outcome of ``task``, or None while it is open; of several results the one with the highest token.
+    """Return the outcome of ``task``, or None if it has not ended; of several results, that with the highest token.
 
-    A result is valid if a node that may order tasks wrote it (``RESULT``), or an agent with the signatures of a
-    majority of the quorum members for the end under its token (``DONE``).
+    A result is valid if it was written by a node that may order tasks (``RESULT``).  A result of an agent (``DONE``) is
+    valid if a majority of the quorum members has signed that the task ended under its fencing token.
     """
     results = [
         result
@@ -370,7 +372,7 @@ def find_outcome(task: Task, records: Iterable[Record]) -> Result | None:
 
 
 def with_newest_council(task: Task, records: Iterable[Record]) -> Task:
-    """Return ``task`` with the newest quorum members that the records of its group prove."""
+    """Return ``task`` with the newest quorum members that are proved by ``records``, the records of its group."""
     pinned = parse_charter(task.charter)
     newest = pinned
     for record in records:

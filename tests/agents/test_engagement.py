@@ -515,7 +515,7 @@ class EngagementTests(SynchronousTestCase):
         self.step()
         self.step()
         faults = [line for line in self.log_lines if "broken" in line and not line.startswith("standby")]
-        self.assertEqual(faults, ["broken has no opinion (ZeroDivisionError: no luck); nearest: 0.50, least of 2"])
+        self.assertEqual(faults, ["broken failed (ZeroDivisionError: no luck); nearest: cost 0.50, the lowest of 2"])
         self.assertEqual(self.engagement.me.assigned, self.others[2].node_id.hex())
         self.assertEqual(len(self.flushLoggedErrors(ZeroDivisionError)), 1)
 

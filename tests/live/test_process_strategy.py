@@ -131,9 +131,9 @@ class ProcessStrategyTests(SynchronousTestCase):
     def test_others(self) -> None:
         """A strategy is skipped if its reply is too large, it needs too much memory, its process died or it raises."""
         for name, why in (
-            ("Giant", "bytes, more than"),
+            ("Giant", "bytes; at most"),
             ("Hungry", "MemoryError"),
-            ("Quitting", "its process has died"),
+            ("Quitting", "the process of the strategy has ended"),
             ("Raising", "ZeroDivisionError: I divide"),
             ("Absent", "has no attribute 'Absent'"),
         ):
@@ -156,12 +156,12 @@ class ProcessStrategyTests(SynchronousTestCase):
         lost = worker._process
         lost.kill()
         lost.wait()
-        self.assertIn("its process has died", guard.find(TEAM).reason)
+        self.assertIn("the process of the strategy has ended", guard.find(TEAM).reason)
         self.assertEqual(self.loaded(guard).strategy, "Good")
         guard.stop()
         found = guard.find(TEAM)
         self.assertEqual((found.assigned_agent, found.strategy), ("b", "nearest"))
-        self.assertIn("it was stopped", found.reason)
+        self.assertIn("the strategy was stopped", found.reason)
         self.assertIsNone(worker._process)
         self.flushLoggedErrors()
 

@@ -146,7 +146,7 @@ def ATTEMPT(what):
             losses += runner.state in (State.LOST, State.OUT)
         self.assertEqual(losses, MAX_LOSSES)
         guard = GuardedStrategy(PushedStrategy(runner), twice=True)
-        self.assertIn("no opinion", guard.find(TEAM).reason)
+        self.assertIn(" failed (", guard.find(TEAM).reason)
         self.flushLoggedErrors()
 
     def test_what_it_says_is_limited(self) -> None:

@@ -82,7 +82,7 @@ class StrategiesTests(SynchronousTestCase):
         self.assertIs(early.get("spare", {}), guard)
         early.stop()
         late.stop()
-        self.assertIn("it was stopped", early.get("spare", {}).find([Report("a", 1.0)]).reason)
+        self.assertIn("the strategy was stopped", early.get("spare", {}).find([Report("a", 1.0)]).reason)
         error = self.assertRaises(UnknownStrategy, late.get, "spare", {})
         self.assertIn("the node has stopped", str(error))
         self.assertEqual((len(self.processes), self.alive), (1, 0))

@@ -61,7 +61,7 @@ class ChaosTests(SynchronousTestCase):
         self.team()
         for line, code, said in (
             ("dog1 fly", 2, "there is no fault 'fly'; choose one of kill, freeze"),
-            ("dog1 loss --amount 2", 2, "amount: 2.0 is out of range; give 0 to 1"),
+            ("dog1 loss --amount 2", 2, "amount: 2.0 is out of range; it must be from 0 to 1"),
             ("cat1 loss", 1, "no device has the name cat1 within 60 s; present devices: vaio, dog1, dog2, dog3"),
             ("run nowhere.toml", 2, "nowhere.toml: cannot be read"),
         ):

@@ -67,7 +67,7 @@ class RefusalTests(SynchronousTestCase):
             self.assert_says(self.refusal("--config", path), path, *parts)
         missing = str(self.folder / "nowhere.toml")
         flags: tuple[tuple[tuple[str, ...], tuple[str, ...]], ...] = (
-            (("--config", missing), (missing, "cannot be read", "name a settings file")),
+            (("--config", missing), (missing, "cannot be read", "use a settings file")),
             (("--port", "0"), ("--name", "is missing")),
             (("--name", "a b"), ("command line: --name",)),
             (("--name", "a", "--port", "70000"), ("command line: --port", "65535")),

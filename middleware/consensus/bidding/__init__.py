@@ -1,5 +1,6 @@
-"""Bidding.
+"""Bids of agents for a task, and their announcement by the task's quorum members.
 
-Bids for a task travel to its quorum members (``direct``, ``tree`` or ``flood``) and an announcement returns.
-``auctions`` uses a node's endpoint; all other modules are pure.
+Bids are sent to the quorum members directly (``bid_delivery``) or through other nodes (``tree``). As long as no quorum
+member is reachable, they can be flooded (``flood``). A quorum member then announces the best bids (``announcer``).
+Only ``auction_service`` and ``group`` use the network; all other modules are pure.
 """

@@ -1,8 +1,8 @@
-"""Announcements: the best bids of an auction, signed by one quorum member; pure.
+"""An announcement contains the best bids of an auction, signed by one quorum member; pure.
 
-An announcement may be wrong without harm: it influences which agent should act, but only a lease gives the right to
-act.  Of two announcements the one with the higher number is valid; of equal numbers the one by the member with the
-lower rank.
+A wrong announcement is harmless: it influences which agent should act, but only a lease gives the right to act.  Of two
+announcements, the one with the higher number is valid; if the numbers are equal, the one from the member with the lower
+rank is valid.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from middleware.entangled.value import is_natural
 
 @dataclass(frozen=True)
 class AnnouncedReport:
-    """One report that stands, and the revision of its bid."""
+    """One of the best reports, and the revision of its bid."""
 
     report: Report
     revision: int = 0
@@ -30,7 +30,7 @@ class AnnouncedReport:
 
 @dataclass(frozen=True)
 class Announcement:
-    """The ``number``-th announcement, from 1, of the quorum member with this ``rank``."""
+    """One announcement, with ``number`` counted from 1, of the quorum member with the given ``rank``."""
 
     number: int
     rank: int
@@ -44,15 +44,15 @@ class Announcement:
 
     @property
     def reports(self) -> tuple[Report, ...]:
-        """The reports that stand."""
+        """The announced reports."""
         return tuple(entry.report for entry in self.entries)
 
     def sign(self, sign: Callable[[bytes], bytes], auction: Auction) -> Announcement:
-        """Return this announcement with the signature of ``sign`` for ``auction``."""
+        """Return this announcement for ``auction`` with the signature that ``sign`` returns."""
         return replace(self, signature=sign(self._signed_bytes(auction)))
 
     def is_genuine(self, auction: Auction) -> bool:
-        """Return whether a quorum member of ``auction`` signed exactly this announcement for it."""
+        """Return whether the quorum member with this rank signed exactly this announcement for ``auction``."""
         if self.rank >= len(auction.council):
             return False
         return is_signature_valid(auction.council[self.rank].public, self._signed_bytes(auction), self.signature)

@@ -1,7 +1,7 @@
-"""The announcing side of an auction: a quorum member collects bids, shares them with the other members, and announces.
+"""Announce the best bids of an auction: collect bids at a quorum member and share them with the other members.  Pure.
 
-The first member announces; the next one replaces it if it is silent.  Two members may announce at once without harm:
-see ``announcement``.  Pure.
+The first member makes the announcement; if it is silent, the next member does.  Two announcements at the same time are
+harmless (``announcement``).
 """
 
 from __future__ import annotations
@@ -18,20 +18,21 @@ from middleware.consensus.bidding.summary import Summary
 from middleware.consensus.strategy import Report
 
 REPLACEMENT_DELAY_S = 0.4
-"""Seconds after which the next member announces instead of a silent one: the timeout of one message."""
+"""Seconds after which the next member replaces a silent one: the timeout of one message."""
 LATE_BIDS_S = 0.05
-"""Seconds over which bids after the announcement are collected."""
+"""Seconds for which bids that arrive after the announcement are collected."""
 GATHER_S = 0.1
-"""Seconds over which single bids are collected before they are sent to other members."""
+"""Seconds for which bids are collected before they are sent to other members."""
 INFORMED_MEMBERS = 2
-"""Number of other members that are kept informed: the first that answer, since they announce or replace."""
+"""Number of other members that get all bids: the first members that answer, because one of them announces if the first
+member fails."""
 RETRY_PAUSE_S, MAX_RETRY_PAUSE_S = 1.0, 30.0
-"""Initial and maximum seconds after which a silent member is tried again; doubled each time."""
+"""Seconds after which a silent member is tried again: first and maximum value, doubled each time."""
 MAX_COUNTED_BIDDERS = 4096
 
 
 class Announcer:
-    """The quorum member with this ``rank`` in ``auction``; ``sign`` signs for it."""
+    """The quorum member with the given ``rank`` in ``auction``; ``sign`` returns its signature."""
 
     def __init__(self, auction: Auction, rank: int, rule: MergeRule, sign: Callable[[bytes], bytes]) -> None:
         self.summary = Summary(rule)
@@ -82,7 +83,7 @@ class Announcer:
         self._number = max(self._number, announcement.number)
 
     def make_due_announcement(self, last: Announcement | None, is_strict: bool, now: float) -> Announcement | None:
-        """Return the announcement that is due after ``last``; with ``is_strict`` also if only standbys changed."""
+        """Return the announcement that is due after ``last``; if ``is_strict``, also when only the standbys changed."""
         if now < self._announce_at:
             return None
         self._announce_at = math.inf
@@ -124,18 +125,18 @@ class Announcer:
         self._schedule_sharing(now)
 
     def _schedule_sharing(self, moment: float) -> None:
-        """Schedule the missing bids for the first members that answer, from ``moment`` on."""
+        """Schedule messages with missing bids to the first members that answer, at ``moment`` or earlier."""
         for member_id in [node_id for node_id in self._known if node_id not in self._silent][:INFORMED_MEMBERS]:
             if self._find_missing_bids(member_id):
                 self._send_at[member_id] = min(self._send_at[member_id], moment)
 
     def _record_known(self, member_id: bytes, bids: Iterable[Bid]) -> None:
-        """Record that a member has ``bids``; only bids to forward are remembered."""
+        """Record that a member has ``bids``; bids that need not be forwarded are not recorded."""
         known = {**self._known[member_id], **{bid.agent: bid.rank for bid in bids}}
         self._known[member_id] = {b.agent: known[b.agent] for b in self.summary.list_bids() if b.agent in known}
 
     def _find_missing_bids(self, member_id: bytes) -> tuple[Bid, ...]:
-        """Return the bids that a member is missing, at most as many as fit into one message."""
+        """Return bids that a member does not have, at most as many as fit into one message."""
         known = self._known[member_id]
         return tuple(bid for bid in self.summary.list_bids() if known.get(bid.agent) != bid.rank)[:MAX_BIDS_PER_MESSAGE]
 
@@ -144,7 +145,7 @@ class Announcer:
         return tuple(AnnouncedReport(report, bids[report.agent].revision) for report in self.summary.standing)
 
     def _changes_decision(self, last: Announcement, entries: tuple[AnnouncedReport, ...], is_strict: bool) -> bool:
-        """Return whether nodes that know ``last`` would decide otherwise with the bids known here."""
+        """Return whether the bids known here would change the decision of nodes that know ``last``."""
         announced = last.reports
         combined = self._rule.merge(_drop_replaced(last.entries, self.summary), tuple(e.report for e in entries))
         if is_strict and set(combined) != set(announced):
@@ -153,7 +154,7 @@ class Announcer:
 
 
 def _drop_replaced(entries: tuple[AnnouncedReport, ...], summary: Summary) -> tuple[Report, ...]:
-    """Return the announced reports that no known bid has replaced."""
+    """Return the announced reports except those that a known bid has replaced."""
     current = []
     for entry in entries:
         known = summary.get(entry.report.agent)

@@ -1,7 +1,7 @@
-"""Auctions: one round of bidding for one task; pure.
+"""An auction is one round of bidding for one task; pure.
 
-Each message starts with its auction, so that forwarding nodes need no record of the task.  Each bid is signed together
-with its auction, so that no node can reuse it for another task, epoch, strategy or quorum.
+Each message starts with the auction, so nodes that forward it need no record of the task.  The signature of a bid also
+covers the auction, so no node can reuse the bid for a different task, epoch, strategy or quorum.
 """
 
 from __future__ import annotations
@@ -25,8 +25,7 @@ MAX_WAITING_S = 600.0
 class Auction:
     """The bidding for ``task_id`` in ``epoch``, decided by ``strategy`` and announced by a member of ``council``.
 
-    ``waiting`` is the waiting period in seconds from the first bid; the bids of an ``exclusive`` auction are never
-    flooded.
+    ``waiting_period`` is in seconds, from the first bid.  The bids of an ``exclusive`` auction are never flooded.
     """
 
     task_id: str
@@ -38,7 +37,7 @@ class Auction:
 
     @cached_property
     def key(self) -> bytes:
-        """The id in the key space to which bids travel: the key of the task's group."""
+        """The key to which bids are forwarded: the key of the task's group."""
         return hash_key(f"task/{self.task_id}")
 
     @cached_property

@@ -1,4 +1,4 @@
-"""The auctions of one node on its endpoint: sends, retries and checks messages.
+"""The auctions of one node: send, retry and check messages at the node's endpoint.
 
 Bids with an invalid signature of their agent, and announcements without a valid signature of a quorum member, are
 rejected here.  ``docs/explanation/choosing-a-robot.md`` describes the remaining influence of a malicious peer.
@@ -38,9 +38,9 @@ from middleware.entangled.wire.admission_check import ROLE, explain
 from middleware.errors import UnknownStrategy
 
 REQUEST_TIMEOUT_S = 0.4
-"""Timeout in seconds of one message: three tries on a path of 100 ms.
+"""Timeout of one message in seconds: three tries on a path with a round-trip time of 100 ms.
 
-A longer one waits longer for failed peers, a shorter one loses slow peers.
+A longer timeout delays the detection of failed peers; with a shorter timeout, slow peers appear to have failed.
 """
 OFFER_METHOD, ANNOUNCE_METHOD, FLOOD_METHOD = "bid.offer", "bid.announce", "bid.cry"
 FALLBACK_STRATEGY = "nearest"
@@ -62,19 +62,22 @@ class Bidding:
         return self._last_report is not None
 
     def report(self, report: Report) -> None:
-        """Bid, or replace the bid; an equal bid is not sent again.  Raises ``ValueError`` for an invalid cost."""
+        """Bid, or replace the earlier bid; an unchanged bid is not sent again.
+
+        Raises ``ValueError`` for an invalid cost.
+        """
         if not self._has_published or report != self._last_report:
             self._publish(report)
 
     def withdraw(self) -> None:
-        """Withdraw the bid; without a bid: abstain, so that the quorum members do not wait for this agent."""
+        """Withdraw the bid, or abstain if there is no bid, so that the quorum members do not wait for this agent."""
         if not self._has_published or self._last_report is not None:
             self._publish(None)
 
     def expect_bidders(self, bidders: float) -> None:
-        """As a quorum member, close the bidding as soon as that many agents have bid or abstained.
+        """At a quorum member, close the bidding as soon as ``bidders`` agents have bid or abstained.
 
-        Infinity: at the end of the waiting period.
+        If ``bidders`` is infinite, the bidding is closed at the end of the waiting period.
         """
         self._service.expect_bidders(self.auction, bidders)
 
@@ -88,7 +91,7 @@ class Bidding:
 
 
 class RequestSender(Protocol):
-    """The required part of an endpoint."""
+    """The part of an endpoint that auctions use."""
 
     def ask(
         self, contact: Contact, method: str, *arguments: object, timeout: float | None = None, changes: bool = False
@@ -96,14 +99,15 @@ class RequestSender(Protocol):
         """Send a request, with retransmissions, until the peer answers or the timeout passes."""
 
     def notify(self, contact: Contact, method: str, *arguments: object) -> None:
-        """Call a peer's method once, without an answer."""
+        """Call a method of a peer once, without waiting for an answer."""
 
 
 @dataclass(frozen=True)
 class Environment:
-    """A node's environment: its own contact, its contacts, the team's size, and the strategies by name.
+    """The data about a node that its auctions use: its own contact, its contacts, the team's size, and the strategies.
 
-    ``may_bid`` returns whether the role of the owner of a public key permits bids under a key.
+    ``may_bid(key, public)`` returns whether the role of the owner of ``public`` permits bids under the auction's
+    ``key``.
     """
 
     me: Callable[[], Contact]
@@ -115,7 +119,8 @@ class Environment:
 
 MAX_PARTICIPANTS = 256
 MAX_IDLE_S = 300.0
-"""Seconds after which an inactive participant of another node's auction is removed."""
+"""Seconds of inactivity after which a participant is removed if this node's own agent does not take part in the
+auction."""
 OWN_OPENER = b""
 
 
@@ -127,7 +132,7 @@ class _TableEntry:
 
 
 class ParticipantTable:
-    """Participants by the digest of their auction; those in this node's own auctions are never evicted."""
+    """Participants by the digest of their auction; those in auctions of this node's own agent are never evicted."""
 
     def __init__(self) -> None:
         self._entries: dict[bytes, _TableEntry] = {}
@@ -150,7 +155,10 @@ class ParticipantTable:
             entry.touched_at = now
 
     def add(self, participant: Participant, opener: bytes, now: float) -> list[Participant]:
-        """Add ``participant``, requested by ``opener`` (a node id, or ``OWN_OPENER``); return the evicted ones."""
+        """Add ``participant``, and return the evicted participants.
+
+        ``opener`` is the id of the node that requested it, or ``OWN_OPENER``.
+        """
         idle = [
             d
             for d, entry in self._entries.items()
@@ -168,7 +176,7 @@ class ParticipantTable:
         return evicted
 
     def mark_own(self, digest: bytes, is_own: bool, opener: bytes = b"left") -> None:
-        """Mark a participant as this node's own, or not."""
+        """Mark whether this node's own agent takes part in the auction."""
         entry = self._entries.get(digest)
         if entry is not None:
             entry.opener = OWN_OPENER if is_own else opener
@@ -202,7 +210,7 @@ class AuctionService:
     def take_part(self, auction: Auction, on_summary: OnSummary) -> Bidding:
         """Take part in ``auction``.
 
-        ``on_summary`` is called with each announced set of reports, immediately if there is one.
+        ``on_summary`` is called with each announced set of reports; if there is one already, it is called immediately.
         """
         participant = self._get_participant(auction, OWN_OPENER)
         bidding = Bidding(auction, on_summary, self)
@@ -225,34 +233,36 @@ class AuctionService:
     def answer_offer(
         self, peer: Contact, auction: list[object], bids: list[object], age_ms: int, is_shared: bool
     ) -> list[object] | None:
-        """Process a peer's bids; returns the announcement, if there is one.
+        """Process a peer's bids; return the announcement, or None if there is none yet.
 
-        Raises ``Refused`` if this node does not take them.
+        Raises ``Refused`` for invalid bids, and if too many other nodes send their bids to this node.
         """
         about = _require_auction(auction)
         if not 0 <= age_ms <= 1000 * MAX_WAITING_S:
             raise Refused(f"the age of an offer must be 0 to {1000 * MAX_WAITING_S:g} milliseconds")
         checked = self._check_bids(about, bids)
-        # A peer may claim to send to all quorum members for its own bid only.
+        # Only a bidder itself, not a forwarding node, may state that its bid is sent to all quorum members.
         is_own = all(bid.public == peer.public for bid in checked)
         participant = self._get_participant(about, peer.node_id)
         if not participant.has_room(peer):
-            raise Refused("too many nodes send their bids here; use another contact that is nearer to the key")
+            raise Refused(
+                "too many nodes send their bids to this node; use a different contact that is nearer to the key"
+            )
         now = self._clock.seconds()
         announcement = participant.on_offer(checked, peer, age_ms / 1000, is_shared and is_own, now)
         self._send_due(participant)
         return announcement.pack() if announcement is not None else None
 
     def answer_announcement(self, peer: Contact, auction: list[object], announcement: list[object]) -> None:
-        """Process an announcement of a quorum member, from any peer."""
+        """Process an announcement of a quorum member; any peer may forward it."""
         about = _require_auction(auction)
         participant = self._participants.get(about.digest)
-        if participant is not None:  # other nodes do not need it
+        if participant is not None:  # a node that does not take part in the auction ignores the announcement
             self._process_announcement(participant, announcement)
             self._send_due(participant)
 
     def answer_flood(self, peer: Contact, auction: list[object], bids: list[object]) -> None:
-        """Process flooded bids of a neighbour that reaches no quorum member."""
+        """Process bids flooded by a neighbour that reaches no quorum member."""
         about = _require_auction(auction)
         if about.exclusive:
             raise Refused("bids for an exclusive task must be sent to its quorum members")
@@ -286,7 +296,7 @@ class AuctionService:
         return participant
 
     def _check_bids(self, auction: Auction, content: list[object]) -> list[Bid]:
-        """Decode bids and check their signatures; raises ``Refused``."""
+        """Decode bids and check their signatures; raise ``Refused`` for an invalid one."""
         if len(content) > MAX_BIDS_PER_MESSAGE:
             raise Refused(f"a message may have at most {MAX_BIDS_PER_MESSAGE} bids, not {len(content)}")
         participant = self._participants.get(auction.digest)
@@ -296,38 +306,38 @@ class AuctionService:
             if bid is None:
                 raise Refused("a bid must have a key, a finite cost of at least 0, a revision and a signature")
             if not self._environment.may_bid(auction.key, bid.public):
-                continue  # the sender may also forward permitted bids
+                continue  # do not reject the message, because other bids in it may be permitted
             known = participant.summary.get(bid.agent) if participant is not None else None
             if known is not None and known.rank == bid.rank:
-                bids.append(known)  # already checked; the signature of the copy may differ
+                bids.append(known)  # already checked
             elif bid.is_genuine(auction):
                 bids.append(bid)
             else:
-                raise Refused("invalid signature of a bid for this auction")
+                raise Refused("the signature of a bid for this auction is not valid")
         if content and not bids:
-            raise Refused(f"no valid bid: {explain(ROLE)}", ROLE)
+            raise Refused(f"no bid is permitted: {explain(ROLE)}", ROLE)
         return bids
 
     def _process_announcement(self, participant: Participant, content: object) -> None:
-        """Check and process an announcement; raises ``Refused``."""
+        """Check and process an announcement; raise ``Refused`` if it is invalid."""
         announcement = parse_announcement(content)
         if announcement is None:
             raise Refused("an announcement must have a number, the rank of a quorum member, reports and a signature")
         if participant.announcement is not None and announcement.precedence <= participant.announcement.precedence:
             return
         if not announcement.is_genuine(participant.auction):
-            raise Refused("invalid signature of an announcement: no quorum member of the task made it")
+            raise Refused("the announcement is not signed by a quorum member of the task")
         participant.on_announcement(announcement, self._clock.seconds())
         if participant.is_superseded and participant.own_bid is not None:
             self._bid(participant, participant.own_bid.report)
 
     def publish(self, auction: Auction, report: Report | None) -> None:
-        """Make or withdraw this node's bid in ``auction``.  Raises ``ValueError`` for an invalid cost."""
+        """Make this node's bid in ``auction``, or withdraw it (None).  Raise ``ValueError`` for an invalid cost."""
         if report is not None:
             if not is_cost(report.cost):
                 raise ValueError(f"cost must be finite and at least 0, not {report.cost!r}")
             if report.agent != self._identity.node_id.hex():
-                raise ValueError("a node may bid for its own agent only")
+                raise ValueError("a node may bid only for its own agent")
         participant = self._get_participant(auction, OWN_OPENER)
         self._bid(participant, report)
         self._send_due(participant)
@@ -337,7 +347,7 @@ class AuctionService:
         participant.make_bid(bid, self._path_choice.choose(self._environment.team_size()), self._clock.seconds())
 
     def expect_bidders(self, auction: Auction, bidders: float) -> None:
-        """Close the bidding as soon as that many agents have bid or abstained."""
+        """Close the bidding as soon as ``bidders`` agents have bid or abstained."""
         participant = self._get_participant(auction, OWN_OPENER)
         participant.expect_bidders(bidders)
         self._send_due(participant)
@@ -356,13 +366,13 @@ class AuctionService:
             try:
                 bidding.on_summary(reports)
             except Exception:  # third-party code may raise anything
-                self._log.failure("the listener of announcements for {task} failed", task=bidding.auction.task_id)
+                self._log.failure("the callback for announcements of {task} failed", task=bidding.auction.task_id)
 
     def _log_fault(self, method: str, error: Exception) -> None:
         self._log.error("a strategy's {method} raised {error!r}; using nearest instead", method=method, error=error)
 
     def _send_due(self, participant: Participant) -> None:
-        """Send all due messages, and set the timer for the next ones."""
+        """Send all messages that are due, and set the timer for the next messages."""
         digest = participant.auction.digest
         if self._is_stopped or digest in self._sending or self._participants.get(digest) is not participant:
             return
@@ -405,7 +415,7 @@ class AuctionService:
         request.addCallbacks(
             self._on_answer, self._on_failure, callbackArgs=(participant, message), errbackArgs=(participant, message)
         )
-        request.addErrback(lambda failure: self._log.failure("sending bids failed", failure))
+        request.addErrback(lambda failure: self._log.failure("bids or an announcement could not be sent", failure))
 
     def _on_answer(self, answer: object, participant: Participant, message: OutgoingMessage) -> None:
         if isinstance(message, Offer) and answer is not None:

@@ -1,7 +1,7 @@
-"""Bids: one agent's report for one auction, signed by the agent; pure.
+"""A bid is one agent's report for one auction, signed by the agent; pure.
 
 A forwarding node may drop or delay a bid, but cannot change it.  A later bid of the same agent has a higher revision
-and replaces the earlier one; a bid without a report withdraws it.
+and replaces the earlier bid; a bid without a report withdraws it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _DEFAULTS = {f.name: f.default for f in fields(Report) if f.default is not MISSI
 
 @dataclass(frozen=True)
 class Bid:
-    """The report of the agent with the key ``public``, or None if it withdraws its bid."""
+    """A bid of the agent with the key ``public``; ``report`` is None if the agent withdraws its earlier bid."""
 
     public: bytes
     report: Report | None
@@ -40,7 +40,7 @@ class Bid:
 
     @cached_property
     def rank(self) -> tuple[int, bytes]:
-        """The sort key: of two bids of one agent the higher one is valid, even if both have the same revision."""
+        """The sort key: of two bids of one agent, even with equal revisions, that with the higher key is valid."""
         content = msgpack.packb(pack_report(self.report))
         return self.revision, hashlib.blake2s(content, digest_size=8).digest()
 
@@ -49,7 +49,7 @@ class Bid:
         return replace(self, signature=identity.sign(self._signed_bytes(auction)))
 
     def is_genuine(self, auction: Auction) -> bool:
-        """Return whether its agent signed exactly this bid for this auction."""
+        """Return whether the agent signed exactly this bid for ``auction``."""
         return is_signature_valid(self.public, self._signed_bytes(auction), self.signature)
 
     def pack(self) -> list[object]:
@@ -95,17 +95,17 @@ def parse_report(content: object, agent: str) -> Report | None:
         default = _DEFAULTS.get(name, MISSING)
         if default is MISSING or not _matches_type(value, default):
             return None
-    # Numbers keep their type, because the signature is over the encoded bytes.
+    # Numbers keep their type (1 or 1.0), because the signature covers the encoded bytes.
     return Report(agent, content["cost"], **others)
 
 
 def is_cost(value: object) -> bool:
-    """Return whether ``value`` is a valid cost: a finite number of at least 0, within the limit."""
+    """Return whether ``value`` is a valid cost: a number of at least 0 that ``is_number`` accepts."""
     return is_number(value) and value >= 0  # type: ignore[operator]
 
 
 def _from_wire(value: object) -> object:
-    """Return the value before encoding: tuples are encoded as lists."""
+    """Convert a decoded value: tuples were encoded as lists."""
     return tuple(value) if isinstance(value, list) else value
 
 

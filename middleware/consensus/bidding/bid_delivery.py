@@ -1,8 +1,8 @@
-"""The bidder's side: send bids directly to the quorum members of a small team, and check that a bid was counted; pure.
+"""Send an agent's bid directly to the quorum members, and check that the announcement takes it into account; pure.
 
-If a forwarding node of a tree fails, all bids of its subtree are lost.  So a bidder that receives no announcement asks
-a quorum member, and a bidder whose bid should have changed the announcement sends the bid there, within half the
-waiting period.
+If a forwarding node of a tree fails, all bids of its subtree are lost.  So a bidder that receives no announcement
+requests it from a quorum member.  A bidder whose bid should have changed the announcement sends the bid to a quorum
+member, within half the waiting period.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from middleware.consensus.bidding.outgoing_message import Offer
 from middleware.entangled.contact import Contact
 
 ANNOUNCEMENT_DELAY_S = 0.6
-"""Seconds after the waiting period in which an announcement reaches all of 10,000 nodes, with packet loss."""
+"""Seconds after the waiting period until an announcement has reached all of 10,000 nodes, even with packet loss."""
 REQUEST_SPREAD_SHARE = 0.25
-"""Share of the waiting period over which the requests of many nodes are spread at random."""
+"""Share of the waiting period within which each node sends its request at a random time."""
 MIN_PAUSE_S, MAX_PAUSE_S = 0.5, 10.0
-"""Minimum and maximum seconds between two requests of one bidder; the maximum applies while no member answers."""
+"""Minimum and maximum seconds between two requests of one bidder; the maximum applies when no member answers."""
 MAX_RELAY_REQUESTS = 3
-"""Maximum requests of a node that only forwards bids."""
+"""Maximum number of requests of a node that only forwards bids."""
 
 
 class BidCheck:
-    """Checks that the own bid of one node was counted, or that a forwarding node received the announcement."""
+    """Checks that an announcement arrives and takes the node's own bid, if there is one, into account."""
 
     def __init__(self, auction: Auction, own_id: bytes, rule: MergeRule, rng: random.Random) -> None:
         self.own_bid: Bid | None = None
@@ -49,11 +49,11 @@ class BidCheck:
 
     @property
     def is_isolated(self) -> bool:
-        """Whether all quorum members in turn did not answer."""
+        """Whether each quorum member in turn has failed to answer."""
         return self.failures >= len(self._members) > 0
 
     def check_bid(self, bid: Bid, announcement: Announcement | None, is_strict: bool, now: float) -> None:
-        """Check ``bid`` from now on; with ``is_strict`` also if it changes only the standbys."""
+        """Check ``bid`` from now on; if ``is_strict``, also when the bid changes only the standbys."""
         self.own_bid, self._is_strict = bid, is_strict
         if announcement is None:
             if self._request_at == math.inf:
@@ -67,13 +67,13 @@ class BidCheck:
         self._schedule_request(since + waiting + silence)
 
     def on_announcement(self, announcement: Announcement, now: float) -> None:
-        """Compare an announcement with the own bid."""
+        """Compare an announcement with the node's own bid."""
         self._request_at = math.inf
         if not self.is_counted(announcement):
             self._schedule_request(now)
 
     def is_counted(self, announcement: Announcement) -> bool:
-        """Return whether the own bid is in the announcement, would not change it, or does not exist."""
+        """Return whether there is no own bid, or the bid is in the announcement or would not change the decision."""
         if self.own_bid is None:
             return True
         entry = next((e for e in announcement.entries if e.report.agent == self.own_bid.agent), None)
@@ -102,7 +102,7 @@ class BidCheck:
         return [Offer(member, (self.own_bid,) if self.own_bid is not None else (), age, is_inquiry=True)]
 
     def on_answer(self, announcement: Announcement | None, now: float) -> None:
-        """Record that a quorum member has the bid; ``announcement`` is the newest that this node knows."""
+        """Record that a quorum member has the bid; ``announcement`` is the newest one that this node knows."""
         self._is_in_flight = False
         self.failures = 0
         if announcement is None or not self.is_counted(announcement):
@@ -123,12 +123,13 @@ class BidCheck:
 
 
 MAX_TRIES = 3
-"""Maximum messages to one member for one bid; later the announcement shows whether the others received it."""
+"""Maximum number of messages with one bid to one member; after that, the announcement shows whether the bid was
+received."""
 RETRY_PAUSE_S = 0.5
 
 
 class DirectSender:
-    """The messages with a bid that one bidder has to send to each quorum member."""
+    """Sends a bid to each quorum member, with retries."""
 
     def __init__(self, auction: Auction, own_id: bytes) -> None:
         self._members = [member for member in auction.council if member.node_id != own_id]
@@ -139,7 +140,7 @@ class DirectSender:
 
     @property
     def is_isolated(self) -> bool:
-        """Whether no quorum member answered."""
+        """Whether all quorum members have failed to answer."""
         return 0 < len(self._members) <= len(self._silent)
 
     @property

@@ -1,7 +1,7 @@
-"""Flooding: bids go from neighbour to neighbour while no quorum member is reachable; pure.
+"""Flood bids from neighbour to neighbour as long as no quorum member is reachable; pure.
 
-Only for tasks without an exclusive lease.  Messages are not acknowledged: each node has about eight neighbours, which
-compensates for losses.
+Only the bids for tasks without an exclusive lease are flooded.  Messages are not acknowledged; lost messages do no harm
+because each node has about eight neighbours.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from middleware.entangled.kademlia.distance import select_closest
 
 MAX_NEIGHBOURS = 8
 NEAREST_NEIGHBOURS = 4
-"""Number of these neighbours that are the nearest by id, so that every part of the key space is reached."""
+"""Number of neighbours that are the nearest nodes by id, so that every part of the key space is reached."""
 
 
 class Flood:
-    """The flooded bids that one node has received and sends."""
+    """The flooded bids at one node, and their forwarding."""
 
     def __init__(
         self, own_id: bytes, rule: MergeRule, contacts: Callable[[], Iterable[Contact]], rng: random.Random
@@ -36,7 +36,7 @@ class Flood:
         self._is_changed = False
 
     def join(self, bids: Iterable[Bid], sender: Contact | None = None) -> bool:
-        """Add bids, the own one or those of ``sender``; returns whether they changed anything."""
+        """Add bids of ``sender`` (None: the node's own bid); return whether the summary has changed."""
         changed = self.summary.join(bids)
         if sender is not None and len(self._senders) < MAX_NEIGHBOURS:
             self._senders.setdefault(sender.node_id, sender)
@@ -44,14 +44,14 @@ class Flood:
         return changed
 
     def take_due_messages(self) -> list[FloodedBids]:
-        """Return the messages that are due now: one per neighbour for each change."""
+        """Return the messages that are due now: one per neighbour if there was a change."""
         if not self._is_changed:
             return []
         self._is_changed = False
         return [FloodedBids(neighbour, self.summary.list_bids()) for neighbour in self._choose_neighbours()]
 
     def _choose_neighbours(self) -> list[Contact]:
-        """Return the neighbours: the nearest, some random ones, and senders that have this node as a neighbour."""
+        """Return the neighbours: the nearest nodes, random nodes, and nodes that sent flooded bids to this node."""
         if not self._neighbours:
             known = list(self._contacts())
             near = select_closest(known, self._own_id, NEAREST_NEIGHBOURS)

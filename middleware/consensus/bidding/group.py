@@ -1,4 +1,4 @@
-"""The group of participants of one task, as one participant sees it: publishes its report and collects all reports.
+"""The group of participants of one task at one participant: publish its report and collect the reports of all.
 
 Thesis, section 4.2.5: agents assigned to the same task write to one part of the DHT and watch it.
 """
@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from middleware.consensus.bidding.auction_service import Bidding
 
 OnMembers = Callable[[list[Member], Result | None], None]
-"""Called with all present members, including the own one, and the task's outcome (None: it is open)."""
+"""Called with all present members, including this participant, and the task's outcome (None: the task has not
+ended)."""
 
 StartBidding = Callable[[Callable[[tuple[Report, ...]], None]], "Bidding"]
 """Starts bidding; its argument is called with the reports that the quorum members announce."""
@@ -36,9 +37,9 @@ Later = Callable[[float, Callable[[], None]], Callable[[], None]]
 class TaskMembers:
     """The members of one task, merged from two sources; ``view`` is the part of a report that the strategy reads.
 
-    Records under the group's key show the present members; announcements of the quorum members have the best bids.  The
-    later report of the two counts.  Absent members do not bid, but an announced bid of a member whose record has not
-    arrived yet is kept.
+    A member is present if it has a record under the group's key.  Announcements of the quorum members contain the best
+    bids.  Of the two reports of a member, the one that changed last is used.  Bids of absent members are ignored,
+    except that an announced bid is kept if the record of its member has not arrived yet.
     """
 
     def __init__(self, view: ReportView | None = None) -> None:
@@ -52,7 +53,7 @@ class TaskMembers:
         return len(self._present)
 
     def update_present(self, members: Iterable[Member]) -> None:
-        """Process the records; a changed report replaces an announced one."""
+        """Process the members with records; a changed report in a record replaces an announced report."""
         before, self._present = self._present, {member.uuid: member for member in members}
         for uuid, member in self._present.items():
             if uuid in before and self._view.make_report(before[uuid]) != self._view.make_report(member):
@@ -63,9 +64,9 @@ class TaskMembers:
         self._left = (self._left | departed) - self._present.keys()
 
     def update_announced(self, reports: Iterable[Report]) -> None:
-        """Process an announcement; members that it does not name are unchanged.
+        """Process an announcement; the reports of members that are not in it remain unchanged.
 
-        Except members that were announced before their records arrived: their records may be newer.
+        The exception are members that were announced earlier, before their records arrived: their records may be newer.
         """
         named = {report.agent: report for report in reports if report.agent not in self._left}
         for uuid in self._early - named.keys():
@@ -82,7 +83,7 @@ class TaskMembers:
         return self._present.keys()
 
     def list_members(self) -> list[Member]:
-        """Return the present members with their valid reports."""
+        """Return the present members, each with the report to use."""
         return [
             self._view.apply_report(member, self._announced[uuid]) if uuid in self._announced else member
             for uuid, member in self._present.items()
@@ -97,9 +98,9 @@ class Group:
     """One participant's connection to the group of ``task``.
 
     - ``on_members``: called with the members and the outcome after each change
-    - ``log_failures``: takes writes whose failure is only logged
-    - ``on_orders``: called with all records, which include an operator's orders
-    - ``enter``: starts bidding for the task; None: reports are exchanged by records only
+    - ``log_failures``: called with the Deferred of each write, to log its failure
+    - ``on_orders``: called with all records of the group, which include the orders of operators
+    - ``enter``: starts bidding for the task; None: reports are exchanged only as records
     - ``view``: the part of a report that the strategy reads
     - ``reporters``: decides which participants of a team of many ``devices`` write records
     """
@@ -148,7 +149,7 @@ class Group:
         report = self._view.make_report(member)
         if report is not None:
             self._bidding.report(report)
-        elif self._bidding.has_bid:  # an agent without a first measurement does not abstain
+        elif self._bidding.has_bid:  # an agent that has not measured yet does not abstain
             self._bidding.withdraw()
 
     def withdraw(self) -> None:
@@ -161,7 +162,7 @@ class Group:
             self._bidding.withdraw()
 
     def conclude(self, result: Result, proof: bytes) -> Deferred[Stored]:
-        """Record the outcome with its proof; the record remains when this node leaves."""
+        """Record the outcome with the proof of the lease; the record remains when this node leaves."""
         return self._entangled.put(self._key, DONE, pack_done(result, proof), "team")
 
     def leave(self) -> None:
@@ -206,11 +207,11 @@ class Group:
         ]
 
     def _count_expected_bidders(self) -> float:
-        """Return the number of bidders after which the quorum members need not wait longer."""
+        """Return the number of bidders after which the quorum members need not wait for more."""
         return math.inf if self._reporters.is_partial(self._seconds()) else len(self._members)
 
     def _write_record(self) -> None:
-        """Write the record if the reporters require it, or set a timer for later."""
+        """Write this participant's record if it is due, or set a timer for the time at which it will be due."""
         self._cancel()
         if self._me is None:
             return

@@ -1,7 +1,7 @@
-"""Merge and evaluate the reports of one auction with its strategy, protected against faulty strategies; pure.
+"""Merge and evaluate the reports of one auction with its strategy, with protection against faulty strategies; pure.
 
-If a third-party strategy raises, returns invalid reports, or has no ``merge``, the ``MAX_LEADING_REPORTS`` cheapest
-reports are used.  Reports that a strategy invents are dropped.
+If a third-party strategy raises an exception, returns invalid reports, or has no ``merge``, the ``MAX_LEADING_REPORTS``
+cheapest reports are used.  Reports in the result that were not in the arguments are dropped.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from typing import Any
 from middleware.consensus.strategy import Report
 
 MAX_LEADING_REPORTS = 4
-"""Number of reports in a summary by default: the winner and its standbys.  Signed, they fill a datagram."""
+"""Default number of reports in a summary: the winner and its standbys, whose signed bids fill one datagram."""
 MAX_REPORTS = 1024
 
 OnFault = Callable[[str, Exception], None]
-"""Called with the name of a method that raised, and the exception."""
+"""Called with the name of the method that raised an exception, and the exception."""
 
 
 class MergeRule:
@@ -29,7 +29,7 @@ class MergeRule:
         self._on_fault = on_fault
 
     def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
-        """Return the join of two summaries: a subset of their reports, one per agent, in a defined order."""
+        """Return the join of two summaries: a sorted subset of their reports with one report per agent."""
         known_reports = {*a, *b}
         try:
             chosen = list(
@@ -43,7 +43,7 @@ class MergeRule:
         return tuple(sorted(chosen, key=_sort_key))
 
     def decide(self, reports: Sequence[Report]) -> tuple[str | None, str]:
-        """Return the decision without its standbys, in a form that can be compared."""
+        """Return the decision, without standbys, as values that can be compared."""
         try:
             consensus = self._find(tuple(reports))
             agent = consensus.assigned_agent
@@ -57,11 +57,11 @@ class MergeRule:
 
 
 def select_leading(a: Sequence[Report], b: Sequence[Report], limit: int = MAX_LEADING_REPORTS) -> tuple[Report, ...]:
-    """Return the ``limit`` cheapest reports of both, one per agent; ties are broken by the agent's id."""
+    """Return the ``limit`` cheapest reports in ``a`` and ``b``, one per agent; ties are broken by the agent's id."""
     once: dict[str, Report] = {}
     for report in (*a, *b):
         known = once.get(report.agent)
-        # Two different reports of one agent are rare; their content decides, not their order of arrival.
+        # In the rare case of two different reports of one agent, their content decides, not their order of arrival.
         if known is None or (report != known and (report.cost, repr(report)) < (known.cost, repr(known))):
             once[report.agent] = report
     return tuple(sorted(once.values(), key=_sort_key)[:limit])

@@ -9,7 +9,7 @@ from middleware.consensus.bidding.bid import Bid
 from middleware.entangled.contact import Contact
 
 MAX_BIDS_PER_MESSAGE = 64
-"""Maximum number of bids in one message: checking their signatures takes 5 ms.
+"""Maximum number of bids in one message; checking the signatures of so many bids takes 5 ms.
 
 Further bids go into the next message.
 """
@@ -17,11 +17,11 @@ Further bids go into the next message.
 
 @dataclass(frozen=True, eq=False)
 class Offer:
-    """Bids for ``to``.
+    """Bids that are sent to ``to``.
 
-    - ``age``: the seconds since the first known bid was made
-    - ``is_shared``: the bidder itself sends to every quorum member
-    - ``is_inquiry``: the sender asks a quorum member for a missing announcement, or its bid is missing there
+    - ``age``: seconds since the first known bid of the auction
+    - ``is_shared``: the bidder itself sends its bid to every quorum member
+    - ``is_inquiry``: the sender has no announcement, or an announcement that does not take its bid into account
     """
 
     to: Contact
@@ -33,7 +33,7 @@ class Offer:
 
 @dataclass(frozen=True, eq=False)
 class Notice:
-    """The announcement for ``to``."""
+    """The announcement that is sent to ``to``."""
 
     to: Contact
     announcement: Announcement
@@ -41,7 +41,7 @@ class Notice:
 
 @dataclass(frozen=True, eq=False)
 class FloodedBids:
-    """Flooded bids for a neighbour while no quorum member is reachable, without acknowledgement."""
+    """Bids flooded to a neighbour, without acknowledgement, because no quorum member is reachable."""
 
     to: Contact
     bids: tuple[Bid, ...]

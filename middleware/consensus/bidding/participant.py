@@ -1,6 +1,6 @@
-"""One node's part in one auction: it bids, forwards bids, or announces the result; pure.
+"""The participation of one node in one auction: it bids, forwards bids, or announces the best bids; pure.
 
-``take_due_messages`` returns the outgoing messages, and ``due`` the time of the next call.
+``take_due_messages`` returns the outgoing messages, and ``due`` is the time at which it has to be called next.
 """
 
 from __future__ import annotations
@@ -25,17 +25,20 @@ from middleware.consensus.strategy import Report
 from middleware.entangled.contact import Contact
 
 RELAY_DELAY_S = 0.4
-"""Seconds of silence after which a forwarding node asks on behalf of all behind it, before they ask themselves."""
+"""Seconds of silence after which a forwarding node requests the announcement, before the nodes of its subtree do."""
 
 MAX_REVISION = 2**32
-"""Higher announced revisions are considered forged, and the node does not try to exceed them."""
+"""Upper bound of valid revisions; a node ignores a higher announced revision, because it must be forged."""
 
 OnSummary = Callable[[tuple[Report, ...]], None]
-"""Called with the reports that stand, after each change."""
+"""Called with the best reports after each change."""
 
 
 class Participant:
-    """The part of the node ``me`` in ``auction``; ``sign`` signs for it, ``contacts`` returns its contacts."""
+    """The participation of the node ``me`` in ``auction``.
+
+    ``sign`` returns a signature of this node, and ``contacts`` returns its contacts.
+    """
 
     def __init__(
         self,
@@ -89,16 +92,16 @@ class Participant:
 
     @property
     def is_superseded(self) -> bool:
-        """Whether an announced bid from this agent's earlier run replaced its own, so that it has to bid again."""
+        """Whether the agent has to bid again: a bid of its earlier run, with a higher revision, was announced."""
         return self.own_bid is not None and self.own_bid.revision < self.next_revision - 1
 
     def expect_bidders(self, bidders: float) -> None:
-        """Close the bidding as soon as that many agents have bid or abstained."""
+        """Close the bidding as soon as ``bidders`` agents have bid or abstained."""
         if self._announcer is not None:
             self._announcer.expected_bidders = bidders
 
     def make_bid(self, bid: Bid, path: str, now: float) -> None:
-        """Make or withdraw the own bid."""
+        """Make or withdraw this node's own bid; ``path`` is that of ``path_choice``."""
         self._first_bid_at = min(self._first_bid_at, now)
         self.next_revision = max(self.next_revision, bid.revision + 1)
         is_direct = path == DIRECT
@@ -113,16 +116,16 @@ class Participant:
             self._flood_own_bid(now)
 
     def has_room(self, sender: Contact) -> bool:
-        """Return whether this node takes the bids of ``sender``.
+        """Return whether this node accepts bids of ``sender``.
 
-        Quorum members take all, other nodes a limited number.
+        Quorum members accept bids of all nodes, other nodes those of a limited number of nodes.
         """
         return self._announcer is not None or len(self.recipients) < MAX_CHILDREN or self.recipients.has(sender)
 
     def on_offer(
         self, bids: Iterable[Bid], sender: Contact, age: float, is_shared: bool, now: float
     ) -> Announcement | None:
-        """Process the bids of ``sender``; returns the announcement, if there is one."""
+        """Process the bids of ``sender``; return the announcement, or None if there is none yet."""
         self._first_bid_at = min(self._first_bid_at, now - age)
         self.recipients.add(sender, is_shared and self._announcer is not None)
         if self._announcer is not None:
@@ -137,7 +140,7 @@ class Participant:
         return self.announcement
 
     def on_announcement(self, announcement: Announcement, now: float) -> None:
-        """Process a checked announcement; older ones are ignored."""
+        """Process a verified announcement; ignore it if it is older than the known one."""
         if self.announcement is not None and announcement.precedence <= self.announcement.precedence:
             return
         self.announcement = announcement
@@ -152,7 +155,7 @@ class Participant:
         self._notify()
 
     def on_flood(self, bids: Iterable[Bid], sender: Contact, now: float) -> None:
-        """Process flooded bids; an exclusive task is not decided by them."""
+        """Process flooded bids; ignore them if the task is exclusive."""
         if self.auction.exclusive:
             return
         self._first_bid_at = min(self._first_bid_at, now)
@@ -211,11 +214,11 @@ class Participant:
 
     @property
     def _is_mine(self) -> bool:
-        """Whether the current announcement is this node's own."""
+        """Whether this node made the current announcement."""
         return self.announcement is not None and self.announcement.rank == self._rank
 
     def _flood_own_bid(self, now: float) -> None:
-        """Flood the own bid, since no quorum member is reachable."""
+        """Flood this node's own bid, because no quorum member is reachable."""
         own = self._bid_check.own_bid
         if own is not None and not self.auction.exclusive and self._flood.join([own]):
             self._flood_result_at = min(
@@ -223,7 +226,7 @@ class Participant:
             )
 
     def _notify(self) -> None:
-        """Report the announced and flooded reports that stand, if they have changed."""
+        """Call ``on_summary`` with the best of the announced and flooded reports, if these have changed."""
         announced = self.announcement.reports if self.announcement is not None else ()
         cried = self._flood.summary.standing
         reports = self._rule.merge(announced, cried) if cried else announced

@@ -1,4 +1,4 @@
-"""Choose the path of bids by the team's size, with hysteresis; pure."""
+"""Choose the path of bids, direct or through a tree, by the size of the team and with hysteresis; pure."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from middleware.entangled.kademlia.distance import distance
 
 DIRECT, TREE = "direct", "tree"
 MAX_DIRECT_BIDDERS = 30
-"""Maximum number of bidders for the direct path: 3 quorum members then receive 90 bids."""
+"""Maximum number of bidders with the direct path; 3 quorum members then receive 90 bids in total."""
 MIN_TREE_BIDDERS = 24
-"""Number of bidders down to which a team that was larger keeps the tree."""
+"""Minimum number of bidders with which a team that has shrunk still uses the tree."""
 
 
 class PathChoice:
@@ -22,7 +22,7 @@ class PathChoice:
         self.path = DIRECT
 
     def choose(self, bidders: int) -> str:
-        """Return the path for that many bidders, given the current path."""
+        """Return the path for the given number of bidders; it also depends on the current path."""
         if bidders > MAX_DIRECT_BIDDERS:
             self.path = TREE
         elif bidders < MIN_TREE_BIDDERS:
@@ -31,16 +31,17 @@ class PathChoice:
 
 
 MAX_WHOLE_TEAM = 50
-"""Up to this many contacts are assumed to be the whole team in a small network: a member table holds 64."""
+"""Maximum number of contacts that are assumed to be the whole team in a small network; a member table has 64
+entries."""
 NEAREST_CONTACTS = 8
-"""Number of nearest contacts by which the size of a large team is estimated: a node knows these reliably."""
+"""Number of nearest contacts from which the size of a large team is estimated, because a node knows all of these."""
 
 
 def estimate_team_size(own_id: bytes, contacts: Iterable[Contact], is_large: bool) -> int:
     """Estimate the number of nodes, including this one, from the density of known ids.
 
-    Ids are uniformly distributed, so the n-th nearest of N nodes is about n / N of the key space away.  In a network
-    that ``is_large`` few nodes know all others, and a new node knows few.
+    Ids are uniformly distributed, so the n-th nearest of N nodes is about n / N of the key space away.  Set
+    ``is_large`` in a network in which a node does not know all others.
     """
     distances = sorted(distance(own_id, contact.node_id) for contact in contacts)
     known = len(distances) + 1

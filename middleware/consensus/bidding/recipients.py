@@ -10,9 +10,10 @@ from middleware.consensus.bidding.outgoing_message import Notice
 from middleware.entangled.contact import Contact
 
 MAX_RECIPIENTS = 1024
-"""Maximum number of listeners; the oldest is removed, and asks for the announcement itself."""
+"""Maximum number of listeners; the oldest is removed, and then has to request the announcement."""
 RETRY_PAUSES_S = (0.0, 1.0, 2.0, 4.0)
-"""Seconds after each failed message until the next; after the last one a listener must ask itself."""
+"""Seconds after each failed message until the next; after the last failure, the listener has to request the
+announcement."""
 NO_PRECEDENCE = (0, 0)
 
 
@@ -29,10 +30,10 @@ class _Recipient:
 
 
 class Recipients:
-    """The listeners of one node in one auction.
+    """The listeners of one node in one auction: nodes that get the announcement from this node.
 
-    A listener that is shared with the other quorum members receives an announcement from the member that made it; the
-    others receive all announcements from this node.
+    A *shared* listener has sent its bid to all quorum members, so it receives each announcement from the member that
+    made it. All other listeners receive all announcements from this node.
     """
 
     def __init__(self) -> None:
@@ -47,12 +48,12 @@ class Recipients:
 
     @property
     def is_shared(self) -> bool:
-        """Whether most listeners are shared, as in a small team, in which every bidder sends to all quorum members."""
+        """Whether most listeners are shared; this is so in a small team."""
         shared = sum(1 for recipient in self._recipients.values() if recipient.is_shared)
         return 2 * shared > len(self._recipients)
 
     def add(self, contact: Contact, is_shared: bool = False) -> None:
-        """Add ``contact`` as a listener, or update it; it is reachable at present."""
+        """Add ``contact`` as a listener, or update a known listener, because ``contact`` is reachable now."""
         known = self._recipients.get(contact.node_id)
         if known is not None:
             known.contact, known.failures, known.send_at = contact, 0, 0.0
@@ -63,7 +64,7 @@ class Recipients:
         self._recipients[contact.node_id] = _Recipient(contact, is_shared)
 
     def record_known(self, contact: Contact, announcement: Announcement) -> None:
-        """Record that a listener has this announcement."""
+        """Record that a listener knows this announcement."""
         recipient = self._recipients.get(contact.node_id)
         if recipient is not None:
             recipient.known_precedence = max(recipient.known_precedence, announcement.precedence)
@@ -99,7 +100,7 @@ class Recipients:
             recipient.failures += 1
 
     def _find_uninformed(self, announcement: Announcement | None, is_mine: bool) -> list[_Recipient]:
-        """Return the listeners that do not know ``announcement`` and have no message under way."""
+        """Return the listeners that do not know ``announcement`` and have no pending message."""
         if announcement is None:
             return []
         return [

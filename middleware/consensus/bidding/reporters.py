@@ -1,8 +1,9 @@
-"""Reporters: the few participants of a large group that write records for all; pure.
+"""Reporters: the few participants of a task in a large team that write records; pure.
 
-In a small team each participant of a task writes a record, and all receive it: n x n messages.  In a larger team all
-send their bids to the quorum members, at constant cost per node, and only the reporters write records: the announced
-agents, agents that act or expect to, and, while there are few records, others in a staggered order.
+In a small team each participant of a task writes a record and receives those of all others: n x n messages.  In a
+larger team all participants send bids to the quorum members, at constant cost per node, and only the reporters write
+records.  The reporters are the announced agents, and the agents that act or are about to act.  As long as there are few
+records, other participants also become reporters, one after another.
 """
 
 from __future__ import annotations
@@ -18,28 +19,29 @@ from middleware.tasks.task import Member
 MAX_SMALL_TEAM = 12
 """Maximum number of devices of a team in which every participant writes."""
 ENOUGH_RECORDS = 8
-"""Number of other records that are sufficient.  Announced agents write in addition.
+"""Number of other records that are sufficient.  Announced agents write records in any case.
 
-Groups up to this size write all records, whatever the size of the team.
+In groups of up to this size all participants write records, whatever the size of the team.
 """
 LISTENING_S = 0.3
-"""Seconds in which a new participant receives the existing records."""
+"""Seconds for which a new participant waits for the existing records."""
 TURN_SPACING_S = 0.02
-"""Average seconds between two turns: five participants write before the first of their records arrives."""
+"""Average seconds between two turns; about five participants write records before the first record arrives."""
 SETTLING_S = 1.0
-"""Seconds after the last turn until its record has reached all."""
+"""Seconds after the last turn until its record has reached all participants."""
 RECORD_PAUSE_S = 1.0
 """Minimum seconds between two records of one reporter without urgent changes."""
 ASSUMED_PRESENT_S = 1.0
-"""Seconds for which an announced agent counts as present before its record arrives."""
+"""Seconds for which an announced agent is assumed to be present before its record arrives."""
 ANNOUNCEMENT_TIMEOUT_S = 3.0
-"""Seconds after the waiting period for which the announcement is awaited."""
+"""Maximum seconds after the waiting period until the announcement arrives."""
 
 
 class Reporters:
-    """The reporters of one task, as the participant ``uuid`` sees them; ``turn_share``, 0 to 1, orders their turns.
+    """The reporters of one task, as known by the participant ``uuid``.
 
-    ``compute_due`` returns when to write.  In a small team all participants are reporters.
+    Participants take turns, ordered by ``turn_share`` (0 to 1).  ``compute_due`` returns when the participant has to
+    write its record.  In a small team all participants are reporters.
     """
 
     def __init__(self, uuid: str, turn_share: float = 0.0) -> None:
@@ -53,11 +55,11 @@ class Reporters:
         self._written_at = -math.inf
 
     def is_partial(self, now: float) -> bool:
-        """Return whether only reporters have written records, so that there may be other participants."""
+        """Return whether there may be participants without records, because only reporters write records."""
         return self._devices > MAX_SMALL_TEAM and now < self._complete_at
 
     def is_known(self, now: float) -> bool:
-        """Return whether the others know this participant; only known agents can be assigned."""
+        """Return whether the other participants know this participant; only known agents can be assigned."""
         return not self.is_partial(now) or self.is_written or self._uuid in self._announced
 
     @property
@@ -71,7 +73,7 @@ class Reporters:
         return bool(self._announced)
 
     def on_records(self, present: Collection[str], devices: int, now: float) -> None:
-        """Process the uuids with records, and the number of devices in the team."""
+        """Process the uuids of the participants with records, and the number of devices in the team."""
         self._devices = devices
         self._is_recorded = self._uuid in present
         if len(present) - self._is_recorded >= ENOUGH_RECORDS:
@@ -86,11 +88,11 @@ class Reporters:
         self._announced = {agent: self._announced.get(agent, now) for agent in agents}
 
     def is_assumed_present(self, agent: str, now: float) -> bool:
-        """Return whether ``agent`` counts as present without a record, because it was announced recently."""
+        """Return whether ``agent`` is assumed to be present because it was announced recently."""
         return now < self._announced.get(agent, -math.inf) + ASSUMED_PRESENT_S
 
     def compute_due(self, me: Member, now: float) -> float:
-        """Return when the record of ``me`` is to be written: now, later, or never (infinity)."""
+        """Return the time at which the record of ``me`` has to be written; infinity: never."""
         if me == self._written:
             return math.inf
         if not self.is_partial(now):
@@ -105,18 +107,18 @@ class Reporters:
         return math.inf
 
     def on_written(self, me: Member | None, now: float) -> None:
-        """Record that ``me`` was written; None: the record was removed."""
+        """Note that the record of ``me`` was written; None: the record was removed."""
         self._written, self._written_at = me, now
 
 
 def make_reporters(uuid: str, key: bytes) -> Reporters:
-    """Return the reporters of the task with the group's ``key``, as ``uuid`` sees them.
+    """Return the reporters of the task whose group has the given ``key``, as known by the participant ``uuid``.
 
-    The farthest nodes come first: the nearest hold the records, and most of them are quorum members.
+    The nodes farthest from the key have the first turns, because the nearest nodes already store the records.
     """
     return Reporters(uuid, 1.0 - distance(bytes.fromhex(uuid), key) / (1 << (8 * ID_BYTES)))
 
 
 def _urgent_part(member: Member) -> tuple[object, ...]:
-    """Return the part of a report that the others must know immediately: the agent's activity and availability."""
+    """Return the part of a report that is published without delay: the agent's activity and availability."""
     return member.status, member.token, member.available, member.cost is None, member.assigned == member.uuid

@@ -1,8 +1,9 @@
-"""The bids of one auction that one node knows; a join: order and repetition make no difference; pure.
+"""The best bids of one auction that one node knows; pure.
 
-Of each agent only the bid with the highest revision counts.  The auction's rule selects the bids that stand, and only
-these are forwarded.  A bid that replaced another one is kept and forwarded even if it does not stand; otherwise a late
-copy of the earlier bid would stand again.
+Adding bids is a join: their order and repetition make no difference.  Only the bid with the highest revision of each
+agent is used.  The auction's rule selects the *standing* bids, those that can affect the decision, and only these are
+forwarded.  A bid that replaced an earlier bid of its agent is kept and forwarded even if it is not standing; otherwise
+a delayed copy of the earlier bid would be selected again.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ MAX_SUPERSEDING = 256
 
 
 class Summary:
-    """The bids that stand under ``rule``, and those that replaced others."""
+    """The standing bids by ``rule``, and the bids that replaced earlier bids."""
 
     def __init__(self, rule: MergeRule) -> None:
         self._rule = rule
@@ -26,7 +27,7 @@ class Summary:
 
     @property
     def standing(self) -> tuple[Report, ...]:
-        """The reports that stand."""
+        """The reports of the standing bids."""
         return self._standing
 
     def list_bids(self) -> tuple[Bid, ...]:
@@ -38,7 +39,7 @@ class Summary:
         return self._bids.get(agent)
 
     def join(self, bids: Iterable[Bid]) -> bool:
-        """Add ``bids``; returns whether the summary has changed."""
+        """Add ``bids``; return whether the summary has changed."""
         before = dict(self._bids)
         newer: dict[str, Bid] = {}
         for bid in bids:
@@ -59,7 +60,7 @@ class Summary:
         return self._bids != before
 
     def _remove_unneeded(self) -> None:
-        """Remove bids that neither stand nor replaced others, and replacing ones beyond the limit."""
+        """Remove bids that neither are standing nor replaced a bid; limit the number of the latter."""
         standing = {report.agent for report in self._standing}
         needed = {agent: bid for agent, bid in self._bids.items() if agent in standing or bid.revision}
         not_standing = [agent for agent in needed if agent not in standing]

@@ -1,8 +1,9 @@
-"""One node of the tree in which bids travel to the task's key (convergecast); pure.
+"""One node of the tree in which bids are forwarded to the task's key (convergecast); pure.
 
-The node merges the bids of its children and sends them to one contact nearer to the key, which confirms.  If that
-contact does not answer, the next nearest is tried, and finally the quorum members.  Nodes nearer to the key wait
-longer, so that they forward all bids in one message.  The tree is as in Scribe, but without stored links.
+The node merges the bids of its children and sends them to its parent, a contact nearer to the key, which confirms them.
+If the parent does not answer, the node tries the next nearest contact, and finally the quorum members.  Nodes nearer to
+the key wait longer, so that they can forward all bids in one message.  The tree resembles that of Scribe, but its links
+are not stored.
 """
 
 from __future__ import annotations
@@ -19,32 +20,34 @@ from middleware.entangled.contact import Contact
 from middleware.entangled.kademlia.distance import distance, select_closest
 
 HOLD_PER_BIT_S = 0.02
-"""Seconds to wait per bit that the own id shares with the key: a hop gains three bits and takes at least 30 ms."""
+"""Seconds to wait for each bit that the node's id shares with the key; a hop adds three bits and takes at least 30
+ms."""
 HOLD_SHARE = 0.5
-"""The maximum wait, as a share of the waiting period."""
+"""Maximum time to wait, as a share of the waiting period."""
 LATE_BIDS_S = 0.05
-"""Seconds over which bids after the first message are collected."""
+"""Seconds for which bids that arrive after the first message are collected."""
 RETRY_PAUSE_S, MAX_RETRY_PAUSE_S = 1.0, 30.0
-"""Initial and maximum seconds after which all contacts are tried again when none answered; doubled each time."""
+"""Seconds after which all contacts are tried again when none of them answered: first and maximum value, doubled each
+time."""
 
 
 MAX_CHILDREN = 64
-"""Maximum number of nodes that may send their bids to a node that is not a quorum member; others use the next contact.
+"""Maximum number of children of a node that is not a quorum member; further nodes use their next contact.
 
-Nodes that joined early are known to far more nodes than others, which would all send to the one nearest to the key: 340
-of 10,000.
+A node that joined early is known to far more nodes than others are.  Without this limit, 340 of 10,000 nodes would send
+their bids to the same early node near the key.
 """
 
 
 MAX_HOPS = 4
-"""Number of contacts that are tried before the quorum members."""
+"""Maximum number of contacts that are tried before the quorum members."""
 
 
 def find_hops(auction: Auction, own_id: bytes, contacts: Iterable[Contact]) -> list[Contact]:
-    """Return the contacts to send to, in order: the nearest contacts to the key, then the quorum members.
+    """Return the possible parents in the order in which to try them: contacts nearest to the key, then quorum members.
 
-    Only contacts nearer than this node are used, so bids do not circulate (Kademlia, section 2).  If the nearest
-    contact is a quorum member, it is the destination, and the other members follow.
+    Only contacts nearer to the key than this node are used, so bids do not circulate (Kademlia, section 2).  If the
+    nearest contact is a quorum member, it is first and the other members follow.
     """
     own = distance(own_id, auction.key)
     nearer = [c for c in contacts if distance(c.node_id, auction.key) < own]
@@ -56,12 +59,12 @@ def find_hops(auction: Auction, own_id: bytes, contacts: Iterable[Contact]) -> l
 
 
 def count_shared_bits(a: bytes, b: bytes) -> int:
-    """Return the length of the common prefix of two ids in bits."""
+    """Return the length in bits of the common prefix of two ids."""
     return 8 * len(a) - distance(a, b).bit_length()
 
 
 class TreeNode:
-    """The forwarding of bids through the node ``own_id``, which is not a quorum member.
+    """Forwards bids at the node ``own_id``, which is not a quorum member.
 
     ``contacts`` returns the node's contacts.
     """
@@ -90,7 +93,7 @@ class TreeNode:
         return math.inf if self._in_flight is not None else self._send_at
 
     def join(self, bids: Iterable[Bid], now: float) -> None:
-        """Add bids."""
+        """Add bids that have to be forwarded."""
         if self.summary.join(bids):
             self._send_at = min(self._send_at, now + (LATE_BIDS_S if self._has_sent else self._hold_s))
 
@@ -114,7 +117,7 @@ class TreeNode:
         self._confirmed.update((bid.agent, bid.rank) for bid in offer.bids)
 
     def on_failure(self, offer: Offer, now: float) -> None:
-        """Record that the parent did not answer; the next parent gets all bids."""
+        """Record that the parent did not answer; all bids are sent to the next parent."""
         self._on_sent(offer, now)
         self._failed_parents.add(offer.to.node_id)
         self._confirmed.clear()

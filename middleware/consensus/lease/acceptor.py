@@ -1,4 +1,4 @@
-"""The acceptor of task leases; it also lists the agents to notify when a lease is released."""
+"""The acceptor of task leases, which also lists the agents to notify when a lease is released."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from middleware.entangled.quorum.register import Register, Reply, ReplyKind
 
 MAX_LISTENERS = 16
 ENDED_AGE_S, IDLE_AGE_S = 600.0, 86_400.0
-"""Seconds after the last change until a register may be evicted: of an ended task, and of any other task."""
+"""Seconds after the last change until a register may be evicted, for an ended task and for any other task."""
 
 
 class LeaseAcceptor(Acceptor[str]):
-    """The acceptor of one node, with its votes in ``store``.
+    """The acceptor of one node, which writes its registers to ``store``.
 
-    It does not check whether a task exists: a lease on an unknown task is harmless and expires.
+    The acceptor does not check whether a task exists, because a lease for an unknown task is harmless and expires.
     """
 
     def __init__(self, store: Store, born_at: float) -> None:
@@ -28,7 +28,7 @@ class LeaseAcceptor(Acceptor[str]):
     def prepare(
         self, key: str, configuration: int, ballot: Ballot, ttl: float, now: float, reserve: float = 0.0
     ) -> Reply:
-        """Promise as ``Acceptor`` does; an agent blocked by a lease is added to the listeners for its release."""
+        """Promise as ``Acceptor`` does; if a lease blocks the agent, add the agent to the listeners for its release."""
         reply = super().prepare(key, configuration, ballot, ttl, now, reserve)
         register = self.log.get(key)
         if reply.remaining > 0.0 and register is not None and register.lease_until > now and not register.is_released:
@@ -56,9 +56,9 @@ class LeaseAcceptor(Acceptor[str]):
 
 
 def may_evict(task_id: str, register: Register, now: float) -> bool:
-    """Return whether a register may be evicted: its lease expired long ago, or its task has ended."""
+    """Return whether a register may be evicted: its task ended, or its lease expired, long ago."""
     age = ENDED_AGE_S if register.is_closed else IDLE_AGE_S
-    # C3: while the task is open an old configuration must not become valid again.
+    # As long as the task is open, an evicted register would make an old configuration valid again.
     return max(register.lease_until, register.touched_at) + age <= now and (
         register.configuration == FIRST_CONFIGURATION or register.is_closed
     )

@@ -1,7 +1,7 @@
-"""The certificate of a task's council (charter); pure.
+"""The charter of a task: the chain of signatures that proves the members of its council; pure.
 
-The member that publishes a task signs its first council.  A majority of each council certifies the next one: every
-member that accepts a change signs it.  So no single node can name a council.
+The node that publishes a task signs its first council.  Every member that accepts a change of the council signs the
+change, so a majority of each council certifies the next council, and no single node can choose it.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ from middleware.entangled.quorum.ballot import (
 from middleware.entangled.quorum.register import Reply
 
 MAX_CHANGES = 64
-"""Maximum changes of one task's council; a change to three members takes 350 bytes, one to seven 700."""
+"""Maximum number of changes of one task's council; a change to three members takes 350 bytes, to seven members 700."""
 MIN_MEMBERS = 3
-"""Minimum members of a new council after a change: a single member of a smaller one would be a majority."""
+"""Minimum number of members after a change; in a smaller council, a single member could be a majority."""
 MAX_TOKEN = 2 * INITIAL_CEILING
-"""Upper bound of the first token of a council, so that one member cannot exhaust the tokens."""
+"""Upper bound of the token with which a new council starts, so that no single member can exhaust the tokens."""
 SIGNATURE_BYTES = 64
 
 Votes = tuple[tuple[int, int, bytes], ...]
-"""For each member that signed: its place in the council, its highest token, its signature."""
+"""For each member that signed: its index in the council, its highest token, and its signature."""
 
 
 class CouncilChange(NamedTuple):
-    """One change: the ``members`` of the next council, and the ``votes`` of the previous one under ``ballot``."""
+    """One change: the ``members`` of the next council, and the ``votes`` of the previous council under ``ballot``."""
 
     members: tuple[Contact, ...]
     ballot: Ballot
@@ -55,7 +55,7 @@ class CouncilChange(NamedTuple):
 
 @dataclass(frozen=True)
 class Charter:
-    """The first council of a task, signed by ``owner``, and its changes, the oldest first."""
+    """The first council of a task, signed by ``owner``, and the changes of the council, the oldest first."""
 
     owner: bytes
     first: tuple[Contact, ...]
@@ -94,7 +94,7 @@ class Charter:
         return replace(self, changes=(*self.changes, CouncilChange(members, ballot, votes)))
 
     def is_genuine(self, task_id: str) -> bool:
-        """Return whether all signatures are valid; does not check whether ``owner`` may publish tasks."""
+        """Return whether all signatures are valid; whether ``owner`` may publish tasks is not checked."""
         return _is_genuine(self.packed, task_id)
 
     @cached_property
@@ -115,42 +115,42 @@ def create_charter(identity: Identity, task_id: str, members: tuple[Contact, ...
 def sign_change(
     identity: Identity, task_id: str, configuration: int, ballot: Ballot, members: tuple[Contact, ...], token: int
 ) -> bytes:
-    """Certify that ``members`` were accepted as the council after ``configuration``, and the highest token granted."""
+    """Sign the change from ``configuration`` to the council ``members``, and the highest granted ``token``."""
     return identity.sign(_change_bytes(task_id, configuration, ballot, members, token))
 
 
 def sign_end(identity: Identity, task_id: str, configuration: int, agent: str, token: int) -> bytes:
-    """Certify that ``agent`` closed the task under ``token``, which it was granted."""
+    """Sign that ``agent`` closed the task under ``token``, the token of its lease."""
     return identity.sign(_end_bytes(task_id, configuration, agent, token))
 
 
 def parse_charter(packed: object) -> Charter | None:
-    """Decode a charter without a check of its signatures; None if it is invalid; never raises."""
+    """Decode a charter without checking its signatures; None if it is malformed; never raises."""
     return _parse_charter(packed) if isinstance(packed, bytes) and 0 < len(packed) <= MAX_PROOF_BYTES else None
 
 
 def is_change_signed(
     member: Contact, task_id: str, configuration: int, ballot: Ballot, members: tuple[Contact, ...], reply: Reply
 ) -> bool:
-    """Return whether ``reply`` has a valid signature of the change by ``member`` (``sign_change``)."""
+    """Return whether ``reply`` contains a valid signature of ``member`` for the change (``sign_change``)."""
     statement = _change_bytes(task_id, configuration, ballot, members, reply.token)
     return is_signature_valid(member.public, statement, reply.proof)
 
 
 def is_end_signed(member: Contact, task_id: str, configuration: int, agent: str, token: int, proof: bytes) -> bool:
-    """Return whether ``proof`` is a valid signature of the end by ``member`` (``sign_end``)."""
+    """Return whether ``proof`` is a valid signature of ``member`` for the end of the task (``sign_end``)."""
     return is_signature_valid(member.public, _end_bytes(task_id, configuration, agent, token), proof)
 
 
 @dataclass(frozen=True)
 class EndProof:
-    """The proof that a task was ended under a token, signed by a majority of the council of ``charter``."""
+    """The proof that a task was closed under a token, signed by a majority of the council of ``charter``."""
 
     charter: Charter
     signatures: tuple[tuple[int, bytes], ...]
 
     def is_genuine(self, task_id: str, agent: str, token: int) -> bool:
-        """Return whether a majority has signed that ``agent`` ended the task under ``token``."""
+        """Return whether a majority has signed that ``agent`` closed the task under ``token``."""
         members = self.charter.members
         statement = _end_bytes(task_id, self.charter.configuration, agent, token)
         return self.charter.is_genuine(task_id) and _is_majority(
@@ -159,13 +159,13 @@ class EndProof:
 
     @property
     def packed(self) -> bytes:
-        """The encoding for a record, without the first council, which the task's record has already."""
+        """The encoding for a record; an unchanged charter is omitted, because the task's record contains it."""
         charter = self.charter.packed if self.charter.changes else b""
         return bytes(msgpack.packb([charter, [list(each) for each in self.signatures]]))
 
 
 def parse_end_proof(packed: object, pinned: Charter) -> EndProof | None:
-    """Decode the proof for the task published with the charter ``pinned``; None if invalid; never raises."""
+    """Decode the proof for the task published with the charter ``pinned``; None if it is malformed; never raises."""
     fields = unpack_note(packed) if isinstance(packed, bytes) and len(packed) <= 2 * MAX_PROOF_BYTES else None
     if not isinstance(fields, list) or len(fields) != 2 or not isinstance(fields[1], list):
         return None
@@ -184,7 +184,7 @@ class CharterVerifier:
         self._may_publish = may_publish
 
     def parse(self, task_id: str, packed: object) -> Charter | None:
-        """Decode and check the charter of ``task_id``; None if anything in it is invalid."""
+        """Decode and check the charter of ``task_id``; None if any part of it is invalid."""
         charter = parse_charter(packed)
         if charter is None or not self._may_publish(charter.owner, task_id) or not charter.is_genuine(task_id):
             return None
@@ -194,7 +194,7 @@ class CharterVerifier:
 # -- inside ---------------------------------------------------------------------------------------------------------
 
 
-@lru_cache(maxsize=64)  # 80 us per signature, and the same charter is read repeatedly
+@lru_cache(maxsize=64)  # checking takes 80 us per signature, and the same charter is checked repeatedly
 def _is_genuine(packed: bytes, task_id: str) -> bool:
     charter = _parse_charter(packed)
     if charter is None or not is_signature_valid(
@@ -214,7 +214,10 @@ def _is_genuine(packed: bytes, task_id: str) -> bool:
 
 
 def _is_majority(members: tuple[Contact, ...], signed: Mapping[int, tuple[bytes, bytes]]) -> bool:
-    """Return whether a majority of ``members`` signed, each the statement at its place."""
+    """Return whether a majority of ``members`` has signed.
+
+    ``signed`` maps the index of a member to its statement and signature.
+    """
     if len(signed) < majority(len(members)) or any(place >= len(members) for place in signed):
         return False
     return all(is_signature_valid(members[place].public, *pair) for place, pair in signed.items())

@@ -1,8 +1,9 @@
-"""The states of a lease client, and its transition table.  Pure.
+"""The states of a lease client, and its transition table; pure.
 
-The client (``lease_client``) turns calls, timers and the results of rounds into events, looks up the transition, and
-performs its actions.  A claim runs through PREPARING, PROMISED if the previous lease has not ended, and PROPOSING to
-HOLDING; a standby alternates between WATCHING and LOOKING until the lease is about to end.
+The client (``lease_client``) converts calls, timers and the results of rounds into events, looks up the transition for
+each event, and performs the actions of the transition.  The states of a claim are PREPARING, then PROMISED if the
+previous lease has not ended, then PROPOSING, then HOLDING.  A standby alternates between WATCHING and LOOKING until the
+lease is about to end.
 """
 
 from __future__ import annotations
@@ -35,57 +36,57 @@ class Event(Enum):
     STAND_BY = "the agent wants the lease when its holder loses it"
     RANK = "the agent's rank among the standbys changed while the lease is not held"
     SUSPECT = "the holder may have failed"
-    FREED = "the holder gave the lease back"
+    FREED = "the holder released the lease"
     OUTRANK = "the device obeyed a higher token"
-    RELEASE = "the agent gives the lease back or stops to claim it"
+    RELEASE = "the agent releases the lease or stops claiming it"
     MOVE = "the agent changes the council"
     MOVED = "the change of the council has ended"
     DUE = "the timer fired"
-    DUE_FREED = "the timer fired soon after the lease was given back"
-    EXPIRED = "the timer fired after the deadline of the own lease"
+    DUE_FREED = "the timer fired soon after the lease was released"
+    EXPIRED = "the timer fired after the deadline of the client's lease"
     NEAR = "the lease ends soon"
-    FAR = "the lease ends late, or at an unknown time"
-    FREE = "a majority says that the lease is free"
-    TAKEN = "no majority says that the lease is free"
-    RECONFIGURED = "a member named a newer council"
+    FAR = "the end of the lease is far off or unknown"
+    FREE = "a majority replies that the lease is free"
+    TAKEN = "no majority replies that the lease is free"
+    RECONFIGURED = "a member reported a newer council"
     PROMISES = "a majority promised, and the lease is free"
     EARLY_PROMISES = "a majority promised before the end of the previous lease"
-    UNFINISHED = "a majority promised, and a member accepted a change of the council before"
+    UNFINISHED = "a majority promised, and a member had accepted a change of the council"
     COMPLETED = "that change is complete"
     GRANTS = "a majority granted the lease, and no member needs another ballot"
     PARTIAL_GRANTS = "a majority granted the lease, and some member needs another ballot"
-    KEPT = "the round failed while the own lease is valid"
-    OUTBID = "the round failed by a higher ballot while the own lease is valid"
-    REJECTED = "the round failed, and there is no own lease"
-    ENDED = "a majority says that the task has ended"
+    KEPT = "the round failed, and the client's lease is valid"
+    OUTBID = "the round failed because of a higher ballot, and the client's lease is valid"
+    REJECTED = "the round failed, and the client has no lease"
+    ENDED = "a majority replies that the task has ended"
 
 
 class Action(Enum):
     """An action at a transition; the value describes it."""
 
-    CANCEL = "drop the round and the timer"
+    CANCEL = "cancel the round and the timer"
     LOOK = "ask when the lease ends"
     PREPARE = "ask for promises under a new ballot"
     PROPOSE = "ask for the lease under the promised ballot"
     RENEW = "ask for the lease again under the ballot that it was granted under"
     COMPLETE = "complete the change of the council"
     LEAP = "choose the next ballot above those of other standbys"
-    LOSE = "forget the own lease, and notify the listener"
-    DROP = "give back what a minority granted, and lose the own lease"
-    NOTIFY = "notify the listener of the own lease"
-    LINE_UP = "estimate the end of the lease: NEAR or FAR follows"
-    AFTER_RANK = "set the timer for the first look, later for higher ranks"
-    AFTER_POLL = "set the timer for the next look"
+    LOSE = "forget the lease, and notify the agent"
+    DROP = "release a claim that only a minority granted, and forget the lease"
+    NOTIFY = "notify the agent of the granted lease"
+    LINE_UP = "estimate the end of the lease, which leads to the event NEAR or FAR"
+    AFTER_RANK = "set the timer for the first poll, later for higher ranks"
+    AFTER_POLL = "set the timer for the next poll"
     AFTER_WAIT = "set the timer for the claim at the end of the lease"
-    AFTER_TURN = "set the timer for the claim of a lease that was given back"
+    AFTER_TURN = "set the timer for the claim of a released lease"
     AFTER_PREVIOUS = "set the timer for the end of the previous lease"
     AFTER_RENEWAL = "set the timer for the renewal"
-    AFTER_RETRY = "set the timer for another try before the deadline"
+    AFTER_RETRY = "set the timer for a retry before the deadline"
     AFTER_BACK_OFF = "set the timer for a random back-off"
 
 
 class Step(NamedTuple):
-    """A transition: the next state, and the actions in their order."""
+    """A transition: the next state, and the actions in the order in which they are performed."""
 
     state: State
     actions: tuple[Action, ...] = ()
@@ -184,12 +185,12 @@ TABLE: Mapping[State, Mapping[Event, Step]] = {
     },
     S.OVER: {E.RELEASE: Step(S.OVER, (A.CANCEL,))},
 }
-"""The transitions.  A pair that is neither here nor in ``IMPOSSIBLE`` changes nothing."""
+"""The transitions.  A pair of state and event that is neither here nor in ``IMPOSSIBLE`` has no effect."""
 
 TIMED = (S.WATCHING, S.WAITING, S.PROMISED, S.HOLDING, S.OUTBID)
 """States in which a timer runs, except between MOVE and MOVED."""
 ASKING = (S.LOOKING, S.PREPARING, S.PROPOSING)
-"""States with a running round."""
+"""States in which a round is running."""
 ACTIVE = tuple(state for state in State if state not in (S.IDLE, S.OVER))
 """States in which the agent wants the lease."""
 _OF_TIMERS = (E.DUE, E.DUE_FREED, E.EXPIRED)
@@ -209,13 +210,13 @@ IMPOSSIBLE: frozenset[tuple[State, Event]] = frozenset(
         *((state, E.DUE_FREED) for state in (S.HOLDING, S.OUTBID)),
     ]
 )
-"""Pairs that cannot occur, such as the result of a round in another state."""
+"""Pairs that cannot occur, for example the result of a round in a state without a running round."""
 
 
 def next_step(state: State, event: Event) -> Step:
-    """Return the transition of ``event`` in ``state``; an event that changes nothing returns ``state`` itself.
+    """Return the transition of ``event`` in ``state``; an event without effect leads to ``state`` itself.
 
-    :raises ValueError: for a pair of ``IMPOSSIBLE``
+    :raises ValueError: for a pair that is in ``IMPOSSIBLE``
     """
     if (state, event) in IMPOSSIBLE:
         raise ValueError(f"{event.name} cannot happen while a lease client is {state.name}")

@@ -1,11 +1,12 @@
-"""The lease client of one agent for one task: it claims, renews and releases the lease, or stands by.
+"""The lease client of one agent for one task: it claims, renews and releases the lease, or is a standby.
 
-A claim has two phases: a majority promises and reports the highest token, then a majority grants.  A renewal needs the
-second phase only.  The deadline counts from the time at which the granted request was *sent*, less a margin for clock
-drift and the time that the robot needs to stop, so it ends before any member grants another lease (consensus rule 5).
+A claim has two phases: a majority promises and reports the highest token, then a majority grants the lease.  A renewal
+needs only the second phase.  The deadline is the ttl after the granted request was *sent*, less a margin for clock
+drift and the time that the robot needs to stop.  So the robot is at rest before any member grants the lease to another
+agent.
 
-The states and transitions of the client are in ``client_states``; this module performs the actions.  ``clock`` has to
-run while the machine is suspended, if the system has such a clock (rule 7).
+The states and transitions of the client are in ``client_states``; this module performs the actions.  ``clock`` should
+be one that continues while the machine is suspended, if the system has such a clock.
 """
 
 from __future__ import annotations
@@ -29,27 +30,27 @@ from middleware.entangled.quorum.register import ReplyKind
 from middleware.entangled.quorum.round import RETRY_INTERVAL_S, Round
 
 CLOCK_MARGIN = 0.02
-"""Relative drift between the clocks of two correct nodes: 2 rho, with rho = 1 %."""
+"""Maximum relative drift between the clocks of two correct nodes, each of which drifts by at most 1 %."""
 RENEWALS_PER_TTL = 3
-"""Number of renewals, or requests of a standby, per ttl."""
+"""Number of renewals of a holder, or requests of a standby, per ttl."""
 RETRY_S = 0.1
 JITTER_S = (0.0, 0.02)
 BACK_OFF_S = (0.02, 0.08)
-"""Seconds (minimum, maximum) before the next attempt when another claim was faster."""
+"""Minimum and maximum seconds before the next attempt after the claim of another agent was faster."""
 SOON_PERIODS = 1.5
-"""Poll periods: a lease that ends within them is claimed at its end without another poll."""
+"""Number of poll periods; a lease that ends within them is claimed at its end without another poll."""
 RELEASE_SPREAD_S = 0.3
-"""Seconds after a notification of release during which members may not know of it yet."""
+"""Seconds after a notification of a release for which some members may not know of the release yet."""
 FIRST_STANDBY_SHARE = 0.8
-"""Share of the promise time before the end of a lease (``EARLY_PROMISE_SHARE``) at which the first standby asks for
-promises, so that a slightly late estimate is still in time."""
+"""Share of the time for early promises (``EARLY_PROMISE_SHARE``) that remains when the first standby requests promises.
+It is below 1, so that members accept the request even if the estimated end of the lease is slightly wrong."""
 GRANT_LEAD_S = 0.1
-"""Seconds before the end of a lease at which the next grant is requested: time for a retry; members delay the reply to
-an early request."""
+"""Seconds before the end of a lease at which the next grant is requested, so that there is time for a retry.  Members
+delay their reply to an early request."""
 STAGGER_S = 0.2
-"""Seconds that each rank of standbys waits longer than the rank before it."""
+"""Additional seconds that each standby waits, compared with the standby of the next lower rank."""
 LATE_TIMER_S = 0.05
-"""Seconds of delay from which a late timer counts as a possible suspension of the process."""
+"""Minimum seconds by which a timer is late if the process may have been suspended."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ class Lease:
 
 @dataclass
 class _HeldLease:
-    """The lease that was granted last: its token (0: none), deadline and ballot."""
+    """The last granted lease: its token (0: none), deadline and ballot."""
 
     token: int = 0
     deadline: float = 0.0
@@ -72,10 +73,10 @@ class _HeldLease:
 
 @dataclass
 class _Standby:
-    """The client's ``rank`` among the standbys, and its knowledge of the lease of another agent.
+    """The client's ``rank`` among the standbys, and its estimates about the lease of another agent.
 
-    ``freed_at`` is the time at which the robot of an agent that released the lease is at rest, ``ends_at`` the
-    estimated end of the lease, and ``is_outbid`` says whether a higher ballot was promised in the last round.
+    If an agent released the lease, ``freed_at`` is the time from which its robot is at rest.  ``ends_at`` is the
+    estimated end of the lease, and ``is_outbid`` is true if a member had promised a higher ballot in the last round.
     """
 
     rank: int = 0
@@ -87,7 +88,7 @@ class _Standby:
 class LeaseClient:
     """The claim of one agent to the task of ``proposer``.
 
-    :param clock: a clock that runs while the machine is suspended
+    :param clock: a clock that continues while the machine is suspended
     :param rng: the source of random pauses
     :param changed: called when the lease is granted, renewed or lost
     :param stop_time: the time in seconds that the robot needs to stop
@@ -120,17 +121,17 @@ class LeaseClient:
 
     @property
     def token(self) -> int:
-        """The token of the lease that is or was held, 0 for none."""
+        """The token of the current or last lease, 0 for none."""
         return self._held.token
 
     @property
     def is_over(self) -> bool:
-        """Whether a majority said that the task has ended."""
+        """Whether a majority has replied that the task has ended."""
         return self.state is State.OVER
 
     @property
     def lease(self) -> Lease | None:
-        """The lease while it is held."""
+        """The lease, or None if it is not held."""
         if self.token and self._clock.seconds() < self._held.deadline:
             return Lease(self.task_id, self.token, self._held.deadline)
         return None
@@ -143,22 +144,23 @@ class LeaseClient:
         self._handle(Event.WANT)
 
     def stand_by(self, rank: int = 1) -> None:
-        """Claim the lease when it is released or expires, lower ranks first; until then listen and poll.
+        """Claim the lease when it is released or expires, lower ranks first; until then poll the council.
 
-        A client that holds or claims the lease only changes its rank.
+        If the client holds or claims the lease, only its rank changes.
         """
         self._set_rank(max(1, rank))
         self._handle(Event.STAND_BY)
 
     def suspect_holder(self) -> None:
-        """Poll the end of the lease now, because the holder may have failed.  It shortens no lease."""
+        """Poll the council now, because the holder may have failed; this does not shorten the lease."""
         if not self._is_recently_released and self.lease is None:
             self._handle(Event.SUSPECT)
 
     def on_released(self, token: int, rest: float = 0.0) -> None:
-        """Handle a notification that the lease with ``token`` was released; its robot moves for ``rest`` more seconds.
+        """Handle a notification that the lease with ``token`` was released.
 
-        The first standby asks for promises at once, so that only the grant is left when that robot is at rest.
+        The robot of the former holder may move for ``rest`` more seconds.  The first standby requests promises
+        immediately, so that only the grant remains to be requested when that robot is at rest.
         """
         self.proposer.note_token(token)
         if self.state in ACTIVE and self.lease is None:
@@ -168,45 +170,50 @@ class LeaseClient:
                 self._handle(Event.FREED)
 
     def on_higher_token(self, token: int) -> None:
-        """Handle a token that a device has obeyed: later claims are above it, and a lower own lease is lost."""
+        """Handle a token that a device has obeyed.
+
+        Later claims use higher tokens, and a lease with a lower token is lost.
+        """
         self.proposer.token = max(self.proposer.token, token)
         if 0 < self.token < token:
             self._handle(Event.OUTRANK)
 
     def release(self, heirs: Sequence[Contact] = (), rest: float = 0.0) -> Deferred[object]:
-        """Release the lease (stop the device first), or stop claiming it; fires when the council has been notified.
+        """Release the lease, or stop claiming it; fire when the council has been notified.
 
-        The council grants nothing before the robot is at rest: for ``rest`` seconds if it cannot be stopped, and its
-        stop time.  The members notify the standbys; this client also notifies ``heirs``, half a round trip earlier.
+        Stop the device first.  The council grants no lease before the robot is at rest: after the robot's stop time,
+        and after ``rest`` more seconds if the robot cannot be stopped now.  The members notify the standbys; this
+        client also notifies ``heirs`` directly, half a round trip earlier.
         """
         done: Deferred[object] = succeed(None)
         if self.lease is not None:
-            # Includes the margin: a later release of another claim repeats the remaining time.
+            # With the margin for clock drift, because a later release of another claim repeats the remaining time.
             moving_s = (rest + self._stop_time) * (1.0 + CLOCK_MARGIN)
             self._at_rest_at = min(self._at_rest_at, self._clock.seconds() + moving_s)
         self._handle(Event.RELEASE)
         if self._held.ballot != NO_BALLOT:
             done = self._send_release(
                 max(self._held.ballot, self._claimed_ballot), heirs
-            )  # which releases the older one, too
+            )  # which also releases the lower ballot
         else:
             self._release_minority()
         self._held, self._claimed_ballot = _HeldLease(), NO_BALLOT
         return done
 
     def change_council(self, members: Sequence[Contact]) -> Deferred[None]:
-        """Change the council to ``members`` (stop the device first).
+        """Change the council to ``members``; stop the device first.
 
-        An own lease is released and reserved for this client, which claims it again at the new council.  Fails as
-        ``LeaseProposer.change_members`` does; then the lease is claimed again at the old one.
+        If this client holds the lease, the lease is released and reserved for this client, which claims it again at the
+        new council.  Fails as ``LeaseProposer.change_members`` does; then the lease is claimed again at the old
+        council.
         """
         return Deferred.fromCoroutine(self._change_council(members))
 
     def close_task(self, token: int) -> Deferred[bytes]:
-        """Close the task, done under ``token``, so that no more leases are granted (stop the device first).
+        """Close the task, which ended under ``token``, so that no more leases are granted; stop the device first.
 
-        A later token of this client takes precedence.  Fires with the proof, signed by a majority of the council; fails
-        as ``LeaseProposer.close`` does.
+        If the client has a higher token, that token is used.  Fires with the proof of the end, signed by a majority of
+        the council; fails as ``LeaseProposer.close`` does.
         """
         return self.proposer.close(max(token, self.token)).addCallback(lambda _: self.proposer.end_proof)
 
@@ -219,7 +226,7 @@ class LeaseClient:
             await deferLater(self._clock, moving_s)
         try:
             await self.proposer.change_members(members, keep=True)
-        except Exception:  # not GeneratorExit, when the coroutine is garbage-collected
+        except Exception:  # not BaseException: GeneratorExit is raised when the coroutine is garbage-collected
             self._handle(Event.MOVED)
             raise
         self._handle(Event.MOVED)
@@ -235,13 +242,13 @@ class LeaseClient:
     def _handle(self, event: Event, round_: Round | None = None, delay: float = 0.0) -> None:
         """Go to the next state and perform the actions.
 
-        :param round_: the round whose result the event is
-        :param delay: seconds, for an event that sets the timer
+        :param round_: the round that led to the event, if any
+        :param delay: seconds until the timer fires, for actions that set it to a given delay
         """
         self.state, actions = next_step(self.state, event)
         self._step_count = step = self._step_count + 1
         for action in actions:
-            if self._step_count == step:  # otherwise a call of the listener has caused another transition
+            if self._step_count == step:  # otherwise the callback has caused another transition
                 self._perform(action, round_, delay)
 
     def _perform(self, action: Action, round_: Round | None, delay: float) -> None:
@@ -294,7 +301,7 @@ class LeaseClient:
     # -- rounds -----------------------------------------------------------------------------------------------------
 
     def _poll(self) -> None:
-        """Ask whether the lease is free, without a promise."""
+        """Ask the council whether the lease is free, without requesting promises."""
         self._cancel()
         self._round = round_ = self.proposer.start_round("lease.prepare", 0, self.proposer.ttl, short=0.0)
         round_.outcome.addCallback(self._handle_poll, self.proposer.configuration)
@@ -304,14 +311,14 @@ class LeaseClient:
             return
         round_.close()
         if self.proposer.configuration != configuration:
-            # Only members of the newest council know the standbys, and notify them of a release.
+            # Poll again, because only members of the newest council notify standbys of a release.
             self._handle(Event.RECONFIGURED)
         else:
             is_free = round_.tally.is_won and not self._compute_stagger()
             self._handle(Event.FREE if is_free else Event.TAKEN, round_)
 
     def _prepare(self) -> None:
-        """Ask for promises; a lease that is held stays valid meanwhile."""
+        """Request promises; if the client holds the lease, it remains valid."""
         self._cancel()
         self._claimed_ballot = ballot = self.proposer.next_ballot()
         kinds = (ReplyKind.GRANTED, ReplyKind.SEALED)
@@ -333,13 +340,13 @@ class LeaseClient:
         if round_.tally.value_to_complete is not None:
             self._handle(Event.UNFINISHED, round_)
         elif wait > 0.0:
-            # The lease is about to expire, or the robot of the agent that released it is about to stop.
+            # The previous lease is about to expire, or the robot of its former holder is about to stop.
             self._handle(Event.EARLY_PROMISES, delay=wait)
         else:
             self._handle(Event.PROMISES)
 
     def _choose_token(self) -> int:
-        """Return the token to claim: the own one if no higher one was granted, else one above all known."""
+        """Return the token to claim: the held token if no higher one was granted, otherwise a new highest token."""
         if self.lease is not None and self.token >= self.proposer.token:
             return self.token
         self.proposer.token += 1
@@ -357,9 +364,9 @@ class LeaseClient:
         if deadline <= self._clock.seconds():
             return self._handle_failure(round_)
         self._held = _HeldLease(token, deadline, ballot)
-        # The device counts the deadline on its own clock, which may be slower than the one of this client.
+        # The device measures the time until the deadline by its own clock, which may be slower than this client's.
         self._at_rest_at = deadline + self._stop_time + self.proposer.ttl * CLOCK_MARGIN
-        # A member that may not grant yet needs no new ballot.
+        # A member that may not grant leases yet does not require a new ballot.
         others = [
             reply for reply in round_.tally.replies.values() if reply.kind not in (ReplyKind.GRANTED, ReplyKind.QUIET)
         ]
@@ -370,7 +377,7 @@ class LeaseClient:
         return won.sent_at + self.proposer.ttl * (1.0 - CLOCK_MARGIN) - self._stop_time
 
     def _is_current_round(self, round_: Round) -> bool:
-        """Learn from a round; return whether it is the newest one, and the task has not ended."""
+        """Learn from the replies of a round; return whether it is the newest round and the task has not ended."""
         self.proposer.learn_from(round_)
         if self._round is not round_:
             return False
@@ -384,7 +391,7 @@ class LeaseClient:
         if self.lease is None:
             self._handle(Event.REJECTED, round_)
         else:
-            # A member that has promised a higher ballot needs a new one, and the time until the deadline is enough.
+            # If a member has promised a higher ballot, the lease can be renewed with a new ballot before the deadline.
             is_outbid = any(reply.kind is ReplyKind.OUTBID for reply in round_.tally.replies.values())
             self._handle(Event.OUTBID if is_outbid else Event.KEPT)
 
@@ -395,14 +402,18 @@ class LeaseClient:
         is_outbid = any(reply.kind is ReplyKind.OUTBID for reply in round_.tally.replies.values())
         free_in = round_.estimate_wait()
         if is_outbid and free_in == math.inf:
-            free_in = 0.0  # the other members did not answer; under a higher ballot they may
+            free_in = 0.0  # members that did not answer may answer a request with a higher ballot
         self._standby.ends_at, self._standby.is_outbid = self._clock.seconds() + free_in, is_outbid
         self._schedule_claim(self._rng.uniform(*(BACK_OFF_S if is_outbid else JITTER_S)))
 
     def _schedule_claim(self, pause: float) -> None:
-        """Set the timer for the claim or, if that is late or unknown, for a poll, as a notification may be lost."""
+        """Set the timer for the claim, or for a poll.
+
+        If the time of the claim is far off or unknown, the client polls first, because a notification may be lost.
+        """
         wait = self._compute_turn_delay() if self._is_recently_released else self._compute_claim_delay()
-        # A healthy holder renews well before the end: a lease that expires so soon is claimed without a poll.
+        # A holder without faults renews its lease well before the end, so a lease that ends soon is claimed without a
+        # poll.
         is_far = wait > SOON_PERIODS * self._poll_period
         self._handle(Event.FAR if is_far else Event.NEAR, delay=(self._poll_period if is_far else wait) + pause)
 
@@ -411,7 +422,7 @@ class LeaseClient:
         return self.proposer.ttl / RENEWALS_PER_TTL
 
     def _compute_claim_delay(self) -> float:
-        """Return the seconds until the claim of an expiring lease; the first standby gets promises before its end."""
+        """Return the seconds until the claim of an expiring lease; the first standby claims before its end."""
         is_first = not (self._compute_stagger() or self._standby.is_outbid)
         lead = FIRST_STANDBY_SHARE * EARLY_PROMISE_SHARE * self.proposer.ttl if is_first else 0.0
         return max(0.0, self._standby.ends_at + self._compute_stagger() - lead - self._clock.seconds())
@@ -420,22 +431,22 @@ class LeaseClient:
         return STAGGER_S * max(0, self._standby.rank - 1)
 
     def _compute_turn_delay(self) -> float:
-        """Return the seconds until the claim of a released lease; the first standby claims at once."""
+        """Return the seconds until the claim of a released lease; 0 for the first standby."""
         wait = self._compute_stagger()
         return wait and max(0.0, self._standby.freed_at - self._clock.seconds()) + wait
 
     @property
     def _is_recently_released(self) -> bool:
-        """Whether the lease was released within ``RELEASE_SPREAD_S`` seconds, so some members may not know it yet."""
+        """Whether the lease was released so recently that some members may not know of it."""
         return self._clock.seconds() < self._standby.freed_at + RELEASE_SPREAD_S
 
     @property
     def _max_wait_s(self) -> float:
-        """The longest remaining lease in seconds that a round waits for; unlimited after a release."""
+        """Maximum remaining seconds of a lease for whose end a round waits; unlimited after a release."""
         return math.inf if self._is_recently_released else RETRY_INTERVAL_S
 
     def _handle_timer(self) -> None:
-        """Handle the timer; one that is late may mean that this process or machine was suspended."""
+        """Handle the timer; if it is late, this process or machine may have been suspended."""
         self._timer = None
         self.late_timer_count += self._clock.seconds() - self._due_at > LATE_TIMER_S
         if self.state is State.PROMISED:
@@ -470,11 +481,11 @@ class LeaseClient:
         self._on_change()
 
     def _send_release(self, ballot: Ballot, heirs: Sequence[Contact] = ()) -> Deferred[object]:
-        """Release ``ballot`` at the council, with the time for which the robot may still move."""
+        """Release ``ballot`` at the council, and state for how long the robot may still move."""
         rest = max(0.0, self._at_rest_at - self._clock.seconds())
         return self.proposer.release(ballot, heirs, rest * (1.0 + CLOCK_MARGIN))
 
     def _release_minority(self) -> None:
-        """Release a claim that only a minority granted, so that it delays no other claimant."""
+        """Release a claim that only a minority granted, so that it does not delay the claims of other agents."""
         if self._claimed_ballot not in (self._held.ballot, NO_BALLOT):
             self._send_release(self._claimed_ballot)

@@ -1,4 +1,4 @@
-"""Encoding of leases in messages (``lease.*``) and in notes of the store; no decoder raises.
+"""Encode leases in messages (``lease.*``) and in notes of the store; no decoder raises an exception.
 
 Messages carry durations, not times of day (PaxosLease, arXiv 1209.4187).
 """
@@ -18,13 +18,13 @@ MAX_COUNCIL = 7
 MAX_PROOF_BYTES = 2**16
 _BUCKETS = 64
 BALLOT_MODULUS = 2**20
-"""Modulus of ballot counters; the remainder is random for each run of an agent."""
+"""Modulus of ballot counters; each run of an agent uses a random remainder."""
 EARLY_PROMISE_SHARE = 0.2
-"""Share of the ttl before the end of a lease in which the next lease may be promised."""
+"""The next lease may be promised at most this share of the ttl before the end of the current one."""
 
 
 def pack_reply(reply: Reply) -> list[object]:
-    """Encode a reply for a message; most have no proof."""
+    """Encode a reply for a message; the proof is omitted if it is empty."""
     is_sealed = reply.kind is ReplyKind.SEALED
     ballot, members = (reply.accepted, reply.value) if is_sealed else (reply.promised, ())
     proof = [reply.proof] if reply.proof else []
@@ -47,7 +47,7 @@ def parse_reply(answer: object) -> Reply | None:
     )
     if not is_valid or kind is None or members is None:
         return None
-    # Negative values and NaN count as 0.
+    # Negative values and NaN become 0.
     remaining = remaining if remaining > 0.0 else 0.0
     ballot = Ballot(counter, agent)
     accepted, value = (ballot, members) if kind is ReplyKind.SEALED else (NO_BALLOT, None)
@@ -91,7 +91,7 @@ def _pack_floor(floor: Floor) -> bytes:
 def _unpack_floor(noted: bytes | None) -> Floor | None:
     state = unpack_note(noted or b"")
     if isinstance(state, list) and len(state) == 2:
-        state = [*state, state[0]]  # an older version with one floor for both
+        state = [*state, state[0]]  # written by an older version, with one floor for counter and token
     if not isinstance(state, list) or len(state) != 3:
         return None
     counter, longest, token = state
@@ -104,10 +104,11 @@ def parse_row(row: object) -> Register | None:
     if not isinstance(row, list) or not 6 <= len(row) <= 8:
         return None
     configuration, ballots, token, ttl, packed, is_over = row[:6]
-    proof = row[6] if len(row) > 6 else b""  # missing in notes of older versions
+    proof = row[6] if len(row) > 6 else b""  # older versions did not write a proof
     if not isinstance(ballots, list) or len(ballots) != 8:
         return None
-    grantee = row[7] if len(row) > 7 else ballots[3]  # older versions have it only for an unreleased lease
+    # Older versions wrote the grantee only as the holder of an unreleased lease.
+    grantee = row[7] if len(row) > 7 else ballots[3]
     members = parse_members(packed)
     is_valid = (
         all(map(is_number, (configuration, token, *ballots[::2])))
@@ -127,7 +128,7 @@ def parse_row(row: object) -> Register | None:
 
 
 def unpack_note(noted: bytes) -> object:
-    """Decode msgpack; None if it is invalid."""
+    """Decode msgpack; None if the bytes are invalid."""
     try:
         return msgpack.unpackb(noted, strict_map_key=True, max_ext_len=0)
     except Exception:  # msgpack raises many types on malformed bytes

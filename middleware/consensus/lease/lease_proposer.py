@@ -1,8 +1,8 @@
-"""The requests of a proposer to the council of a task, the nodes whose majority grants its lease.
+"""The requests of a proposer to the council of a task, a majority of which grants the task's lease.
 
-The task's record names the council with a number, its configuration.  Only a majority of the present council can change
-it, and only while no lease is valid (consensus rules 1 and 2).  The ``charter`` has the signatures of that majority; a
-claim of a single member about another council is ignored.
+The task's record contains the members of the council and its configuration, a number that increases with each change.
+Only a majority of the current council can change the council, and only as long as no lease is valid.  The ``charter``
+contains the signatures of that majority, so a single member cannot make a proposer use a false council.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ IsGenuine = Callable[[int, Reply], bool]
 ParseCharter = Callable[[str, object], Charter | None]
 """Decodes and checks a charter: (task id, packed)."""
 SKIPPED_COUNTERS = 16
-"""Counters to skip: more than a holder uses before a standby asks again."""
+"""Number of ballot counters to skip, more than a holder uses before a standby polls again."""
 
 
 class LeaseHeld(Refused):
@@ -37,7 +37,7 @@ class LeaseHeld(Refused):
 
 
 class Superseded(Refused):
-    """Another change of the council was decided; ``LeaseProposer`` has the present one."""
+    """A different change of the council was decided; ``LeaseProposer`` has the current council."""
 
 
 class NoMajority(Refused):
@@ -45,11 +45,12 @@ class NoMajority(Refused):
 
 
 class LeaseProposer:
-    """The council of one task as the proposer ``agent`` knows it.
+    """The council of one task, as known by the proposer ``agent``.
 
     ``on_change`` is called after a change of the council, to update the task's record.  ``token`` is the highest known
-    token; new claims are above it.  ``charter`` proves the council, ``parse_charter`` decodes and checks charters from
-    members, and ``end_proof`` is the proof that the task was closed under a token.
+    token; new claims use higher tokens.  ``charter`` proves the members of the council, and ``parse_charter`` decodes
+    and checks charters from members.  After ``close``, ``end_proof`` is the proof that the task was closed under a
+    token.
     """
 
     def __init__(
@@ -85,12 +86,12 @@ class LeaseProposer:
         self._silent_since: dict[bytes, float] = {}
 
     def next_ballot(self) -> Ballot:
-        """Return a ballot above all known ones."""
+        """Return a ballot above all known ballots."""
         self._ballot_quotient += 1
         return Ballot(self._ballot_quotient * BALLOT_MODULUS + self._ballot_remainder, self.agent)
 
     def skip_ballots(self) -> None:
-        """Raise the next ballot above unknown ballots of other proposers."""
+        """Raise the next ballot above ballots of other proposers that this client may not know yet."""
         self._ballot_quotient += SKIPPED_COUNTERS
 
     def start_round(
@@ -104,7 +105,8 @@ class LeaseProposer:
     ) -> Round:
         """Start a round with all members, or with ``others``; pass its outcome to ``learn_from``.
 
-        If another agent's lease at a member ends within ``short`` seconds, the round repeats the request then.
+        If a member replies that the lease of another agent ends within ``short`` seconds, the round repeats the request
+        to this member at that time.
         """
         members = others or self.members
         request = (self.task_id, *arguments) if others else (self.task_id, self.configuration, *arguments)
@@ -124,7 +126,7 @@ class LeaseProposer:
         return round_
 
     def ping_members(self) -> None:
-        """Ping the members, to update ``find_silent_members``."""
+        """Send a request to the members, to update ``find_silent_members``."""
         self.start_round("lease.prepare", 0, self.ttl)
 
     def find_silent_members(self, seconds: float) -> tuple[Contact, ...]:
@@ -140,11 +142,11 @@ class LeaseProposer:
             self._adopt_charter(charter, is_news=False)
 
     def note_token(self, token: int) -> None:
-        """Note a token reported by a single node, which may have invented it."""
+        """Note a token that a single node reported; a token that is too high to be credible is ignored."""
         self.token = max(self.token, highest_credible([token], len(self.members)))
 
     def learn_from(self, round_: Round) -> None:
-        """Learn used counters and tokens, and changes of the council, from the replies of a round."""
+        """Learn the used counters and tokens, and changes of the council, from the replies of a round."""
         replies, size = round_.tally.replies.values(), len(self.members)
         self._ballot_quotient = max(
             self._ballot_quotient,
@@ -160,7 +162,7 @@ class LeaseProposer:
         if newest is not None and newest.configuration > self.configuration:
             self._adopt_charter(newest)
             return
-        # Send the charter to members that missed the choice of this council.
+        # Send the charter to members that do not know this council yet.
         for place, reply in round_.tally.replies.items():
             if reply.kind is ReplyKind.BEHIND and reply.configuration < self.configuration:
                 self._install(self.members[place])
@@ -175,33 +177,34 @@ class LeaseProposer:
         return DeferredList(calls, consumeErrors=True)
 
     def close(self, token: int = 0) -> Deferred[None]:
-        """Close the task at its council, so that no more leases are granted; fires when no agent can act on it.
+        """Close the task at its council, so that no more leases are granted; fire when no agent can act on the task.
 
-        ``token`` is the token of the agent that finished the task (its device is at rest), or 0 for a node whose role
-        allows orders.  Fails with ``NoMajority``, or with ``Superseded`` if a higher token was granted.
+        ``token`` is the token of the agent that finished the task, whose device must be at rest.  It is 0 for a node
+        whose role allows orders.  Fails with ``NoMajority``, or with ``Superseded`` if a higher token was granted.
         """
         return Deferred.fromCoroutine(self._close(token))
 
     def change_members(self, members: Sequence[Contact], keep: bool = False) -> Deferred[None]:
-        """Change the council to ``members``; fires when a majority of them has installed it.
+        """Change the council to ``members``; fire when a majority of ``members`` has installed the change.
 
-        With ``keep`` the own lease is released (``LeaseClient.change_council``) and reserved for this agent for one
-        ttl.  Fails with ``LeaseHeld`` while another agent holds a lease, ``NoMajority`` if the old council cannot
-        decide, and ``Superseded`` if another change was in progress, which is then completed instead.
+        If ``keep``, the lease of this agent, which ``LeaseClient.change_council`` has released, is reserved for this
+        agent for one ttl.  Fails with ``LeaseHeld`` if another agent holds the lease, with ``NoMajority`` if the old
+        council cannot decide, and with ``Superseded`` if a different change was in progress, which is then completed
+        instead.
         """
         wanted = tuple(members)
         if not 0 < len(wanted) <= MAX_COUNCIL:
-            raise ValueError(f"a council has 1 to {MAX_COUNCIL} members, not {len(wanted)}")
+            raise ValueError(f"a council must have 1 to {MAX_COUNCIL} members, not {len(wanted)}")
         return Deferred.fromCoroutine(self._change_members(wanted, keep))
 
     async def complete_change(self, ballot: Ballot, prepared: Round, keep: bool = True) -> None:
-        """Complete a change that a member has accepted, because it may be decided already."""
+        """Complete a change that a member has accepted, because it may already be decided."""
         await self._decide(ballot, prepared.tally.value_to_complete, keep)
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _update_silence(self) -> None:
-        """Update the times of silence from the answers to the last round."""
+        """Update the time since which each member is silent from the replies of the last round."""
         if self._last_round is not None:
             round_, members = self._last_round
             for place in round_.answered_places:
@@ -225,16 +228,16 @@ class LeaseProposer:
             closed_at = max(closed_at, self._estimate_lease_end(done))
             if self.configuration != configuration:
                 done.close()
-                continue  # the council has changed meanwhile
+                continue  # the council has changed during the round
             sealed = [reply for reply in done.tally.replies.values() if reply.kind is ReplyKind.SEALED]
             if (
                 done.tally.is_won
                 and sealed
                 and len(done.tally.agreeing_places) - len(sealed) < majority(len(self.members))
             ):
-                # Some accepted a change, which may be decided: the next council has to close as well.
+                # Some members accepted a change, which may be decided, so the next council also has to close the task.
                 if token:
-                    raise NoMajority("the end of the task is not recorded: its council is changing; try again")
+                    raise NoMajority("the end of the task is not recorded: the task's council is changing; try again")
                 others = done.tally.value_to_complete
                 done = await self.start_round("lease.cancel", configuration + 1, kinds=ended, others=others).outcome
                 closed_at = max(closed_at, self._estimate_lease_end(done))
@@ -258,7 +261,7 @@ class LeaseProposer:
             await pause
 
     def _estimate_lease_end(self, done: Round) -> float:
-        """Return the end of a lease that may be valid: any closing majority has a member that granted it."""
+        """Return the latest end of a lease that may still be valid, according to the members that closed the task."""
         return self._clock.seconds() + max(
             (done.tally.replies[place].remaining for place in done.tally.agreeing_places), default=0.0
         )
@@ -273,7 +276,7 @@ class LeaseProposer:
         prepared.close()
         self.learn_from(prepared)
         if self.configuration != before:
-            raise Superseded(f"the council is at configuration {self.configuration} already; check it and try again")
+            raise Superseded(f"the council has changed to configuration {self.configuration}; check it and try again")
         if not prepared.tally.is_won:
             _raise_no_majority(prepared, "the council is unchanged")
         if prepared.tally.value_to_complete is not None:
@@ -281,19 +284,19 @@ class LeaseProposer:
         else:
             await self._decide(ballot, wanted, keep)
         if self.configuration == before + 1 and set(self.members) != set(wanted):
-            raise Superseded("another change of the council was in progress and is complete now; check it")
+            raise Superseded("a different change was in progress and was completed instead; check the council")
 
     async def _decide(self, ballot: Ballot, members: tuple[Contact, ...], keep: bool) -> None:
-        """Have a majority of the old council accept ``members``, then a majority of ``members`` install them."""
-        # The council may change during the awaits below; this decision belongs to the present one.
+        """Make a majority of the old council accept ``members``, then a majority of ``members`` install the change."""
+        # Use this council even if ``self.members`` changes during one of the awaits below.
         old, before = self.members, self.charter
         if before is None or before.configuration != self.configuration:
-            raise Refused("the council of this task was not signed when it was published; submit the task again")
+            raise Refused("the council of this task was not signed when the task was published; submit the task again")
         accepted = await self._run_deciding_round(ballot, members, keep)
         accepted.close()
         if not accepted.tally.is_won:
             self.learn_from(accepted)
-            self.release(ballot, rest=self.ttl)  # a lease of this agent stays valid
+            self.release(ballot, rest=self.ttl)  # this does not release the lease of this agent
             _raise_no_majority(accepted, "the council is unchanged")
         votes = [
             (place, accepted.tally.replies[place])
@@ -305,15 +308,15 @@ class LeaseProposer:
         arguments, kinds = (charter.packed, keep, self.ttl), (ReplyKind.GRANTED, ReplyKind.MOVED)
         installed = await self.start_round("lease.install", *arguments, kinds=kinds, others=members).outcome
         if not installed.tally.is_won:
-            raise NoMajority("the new council is decided, but too few of its members have it; request the change again")
+            raise NoMajority("the new council is decided, but not installed by a majority of it; repeat the change")
         self._adopt_charter(charter)
         for member in old:
-            # Former members can then refer proposers to the new council.
+            # A former member that knows the new council can send its charter to proposers.
             if member not in members:
                 self._install(member, charter)
 
     async def _run_deciding_round(self, ballot: Ballot, members: tuple[Contact, ...], keep: bool) -> Round:
-        """Run the deciding round: a majority of the *old* council excludes open leases and other changes."""
+        """Run the deciding round, in which a majority of the *old* council excludes valid leases and other changes."""
         old, configuration = self.members, self.configuration
 
         def is_genuine(place: int, reply: Reply) -> bool:
@@ -324,7 +327,7 @@ class LeaseProposer:
         return await self.start_round("lease.change", *arguments, is_genuine=is_genuine).outcome
 
     def _install(self, member: Contact, charter: Charter | None = None) -> None:
-        """Send ``member`` the charter of the present council."""
+        """Send the charter of the current council to ``member``."""
         charter = charter or self.charter
         if charter is not None and charter.changes:
             update = (self.task_id, charter.packed, False, self.ttl)
@@ -338,7 +341,7 @@ class LeaseProposer:
 
 
 def _raise_no_majority(round_: Round, what: str) -> None:
-    """Raise the exception for a round without a majority."""
+    """Raise the exception that describes why a round has no majority."""
     replies: list[Reply] = list(round_.tally.replies.values())
     held = [reply.remaining for reply in replies if reply.kind is ReplyKind.HELD]
     if held:

@@ -1,7 +1,7 @@
-"""The lease service of a node: checks requests of peers, passes them to the acceptor, and replies after the write.
+"""The lease service of a node: check requests of peers, pass them to the acceptor, and reply after the write.
 
-``middleware.admission.roles`` checks before which role may call which method: only nodes that may order tasks reach
-``lease.cancel``.
+The role of the caller has already been checked (``middleware.admission.roles``), so only nodes that may order tasks can
+call ``lease.cancel``.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ Answer = list[object] | Deferred[list[object]]
 
 
 class LeaseService:
-    """The lease service of one node: its acceptor, and the lease clients to notify of releases.
+    """The lease service of one node: its acceptor, and the lease clients that are notified of releases.
 
-    It may be created at the first request: ``born_at`` is the start of the node, from which the acceptor's silence
-    counts.  ``charter_verifier`` checks charters; ``may_be_member`` returns whether the owner of a key may be a council
-    member.
+    The service may be created at the first request.  ``born_at`` is the time at which the node started, from which the
+    acceptor computes how long it has to be silent.  ``charter_verifier`` checks charters; ``may_be_member`` returns
+    whether the owner of a key may be a council member.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class LeaseService:
         }
 
     def answer(self, method: str, peer: Contact, arguments: tuple[Any, ...]) -> object:
-        """Run a method for a peer and return the answer; raise ``Refused`` for invalid arguments."""
+        """Run a method for a peer, and return the answer; raise ``Refused`` for invalid arguments."""
         return self._methods[method].run(peer, arguments)
 
     def register(self, client: LeaseClient) -> None:
@@ -147,9 +147,7 @@ class LeaseService:
             or len(members) < MIN_MEMBERS
             or not all(self._may_be_member(member.public) for member in members)
         ):
-            raise Refused(
-                f"the next council has {MIN_MEMBERS} to {MAX_COUNCIL} members of the team that may grant leases"
-            )
+            raise Refused(f"the next council must have {MIN_MEMBERS} to {MAX_COUNCIL} members that may grant leases")
         ballot, now = Ballot(counter, peer.node_id.hex()), self._clock.seconds()
         reply = self._acceptor.accept(task_id, configuration, ballot, members, now, token, keep)
         if reply.kind is ReplyKind.GRANTED:
@@ -161,7 +159,7 @@ class LeaseService:
         _check_arguments(task_id, ttl=ttl)
         charter = self._charter_verifier.parse(task_id, packed)
         if charter is None or not charter.changes:
-            raise Refused("a new council needs the signatures of a majority of the previous one")
+            raise Refused("the new council must be signed by a majority of the previous council")
         is_own = keep and charter.ballot.proposer == peer.node_id.hex()
         reply = self._acceptor.install(
             task_id,
@@ -186,14 +184,14 @@ class LeaseService:
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _notify(self, agents: list[str], task_id: str, rest: float) -> None:
-        """Notify agents that a lease was released."""
+        """Notify ``agents`` that the lease of a task was released."""
         for agent in agents:
             contact = self._contacts.get(agent)
             if contact is not None:
                 self._endpoint.notify(contact, "lease.freed", task_id, 0, rest)
 
     def _remember_agent(self, peer: Contact) -> str:
-        """Return the id of an agent, and store its contact for notifications."""
+        """Return the agent id of ``peer``, and store its contact for notifications."""
         agent = peer.node_id.hex()
         self._contacts.pop(agent, None)
         if len(self._contacts) >= 256:
@@ -210,23 +208,24 @@ class LeaseService:
 
 def _check_arguments(task_id: str, *numbers: int, ttl: float = 1.0, rest: float = 0.0) -> None:
     if len(task_id) > MAX_NAME_BYTES or not all(0 < number < MAX_NUMBER for number in numbers):
-        raise Refused("a lease request needs a task id and positive numbers below 2^62")
+        raise Refused("a lease request must have a valid task id and positive numbers below 2^62")
     if not 0.0 < ttl <= MAX_TTL_S:
-        raise Refused(f"a lease lasts more than 0 and at most {MAX_TTL_S:g} seconds")
+        raise Refused(f"the ttl of a lease must be more than 0 and at most {MAX_TTL_S:g} seconds")
     if not 0.0 <= rest <= MAX_TTL_S:
-        raise Refused(f"a robot stops within 0 to {MAX_TTL_S:g} seconds")
+        raise Refused(f"the time until the robot stops must be 0 to {MAX_TTL_S:g} seconds")
 
 
 MAX_WAIT_S = 0.15
-"""Maximum seconds that a reply is delayed."""
+"""Maximum seconds by which a reply is delayed."""
 MIN_WAIT_S = 0.001
 """Minimum seconds before a proposal is retried."""
 
 
 def propose_when_free(propose: Callable[[], Reply], clock: IReactorTime) -> Deferred[Reply]:
-    """Call ``propose``, and again when another agent's lease ends within ``MAX_WAIT_S``; fire with its reply.
+    """Call ``propose``, and fire with its reply; wait if the lease of another agent ends soon.
 
-    So no round trip passes between the end of one lease and the grant of the next.
+    If that lease ends within ``MAX_WAIT_S``, ``propose`` is called again at its end.  So the next lease is granted
+    without the delay of a round trip.
     """
     return Deferred.fromCoroutine(_propose_when_free(propose, clock))
 

@@ -1,4 +1,4 @@
-"""Average: all agents agree on the weighted mean of their numbers or places."""
+"""Strategy ``average``: all agents agree on the weighted mean of their numbers or positions."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Point = tuple[float, ...]
 class Average(Nearest):
     """The weighted mean of all reported values.
 
-    The agent with the lowest cost acts: it publishes the value, which is identical at all nodes.
+    The agent with the lowest cost acts. Its task is to publish the value, which is identical at all nodes.
     """
 
     name = "average"
@@ -22,7 +22,7 @@ class Average(Nearest):
     reads = ("value", "weight")
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
-        """Decide; ``value`` is () if no agent reports a value."""
+        """Return the decision; its ``value`` is () if no agent reports a value."""
         counted = self.merge(contacts, ())
         if not counted:
             return Consensus(None, strategy=self.name, reason="no agent reports a value")
@@ -31,9 +31,9 @@ class Average(Nearest):
         return build_consensus(self.name, order, counted, f"{self.name} of {len(order)}", value=value)
 
     def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
-        """Return the newest value of each agent, for the task whose id sorts first.
+        """Return the report with the newest value of each agent, for the task with the lowest id.
 
-        If the values have different numbers of coordinates, only those with the fewest count.
+        If the values have different numbers of coordinates, only values with the lowest number of coordinates are used.
         """
         valued = [r for r in (*a, *b) if not refusal(r) and r.value and r.weight > 0.0]
         first = min(((-r.epoch, r.task, len(r.value)) for r in valued), default=None)
@@ -41,12 +41,15 @@ class Average(Nearest):
         return standing(alike, lambda report: -report.sequence)
 
     def combine_points(self, points: Sequence[Point], weights: Sequence[float]) -> Point:
-        """Combine the points of all agents, which may be in any order."""
+        """Return the combined point of all agents; the order of ``points`` makes no difference."""
         return mean(points, weights)
 
 
 def mean(points: Sequence[Point], weights: Sequence[float]) -> Point:
-    """Return the weighted mean of points in any order, rounded once and clamped to the box of the points."""
+    """Return the weighted mean.
+
+    It does not depend on the order of the points, and is clamped to their bounding box.
+    """
     total = math.fsum(weights)
     found = []
     for numbers in zip(*points, strict=True):

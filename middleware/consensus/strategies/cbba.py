@@ -1,8 +1,8 @@
-"""The result of the consensus-based bundle algorithm (CBBA), computed from all reports at once.
+"""Strategy ``cbba``: the result of the consensus-based bundle algorithm (CBBA), computed from all reports.
 
 Choi, Brunet, How, IEEE Transactions on Robotics 25(4), 2009.  The distributed algorithm
-(``benchmarks.consensus.bidder``) converges to the sequential greedy assignment; here the assignment is computed
-directly and then improved by moves and swaps.
+(``benchmarks.consensus.bidder``) converges to the sequential greedy assignment; here that assignment is computed
+directly, and is then improved by moves and swaps of tasks.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from middleware.consensus.assignment import (
 from middleware.consensus.strategy import Consensus, Report, standing
 
 MAX_SWEEPS = 50
-"""Maximum number of passes of moves and swaps over an assignment."""
+"""Maximum number of passes over an assignment with moves and swaps."""
 
 
 class Cbba(MultiTaskStrategy):
-    """The sequential greedy assignment, improved by moves and swaps; for a single task the nearest agent."""
+    """The sequential greedy assignment, improved by moves and swaps; a single task is assigned to the nearest agent."""
 
     name = "cbba"
     version = "1"
 
     def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
-        """Decide all items, one agent each, sorted by task name."""
+        """Return one decision for each item, sorted by task id, each with one agent."""
         items = sort_items(items)
         wanted = {item.task for item in items}
         counted = [r for r in standing(contacts) if r.task in wanted]
@@ -44,7 +44,7 @@ class Cbba(MultiTaskStrategy):
 
 
 def assign_greedily(costs: Mapping[str, Mapping[str, float]], capacities: Mapping[str, int]) -> dict[str, str]:
-    """Return the agent of each task: always the cheapest remaining pair is assigned next; ties are broken by id."""
+    """Return the agent of each task: repeatedly assign the cheapest remaining pair; ties are broken by id."""
     capacity_left = dict(capacities)
     owner: dict[str, str] = {}
     pairs: Iterable[tuple[float, str, str]] = sorted((c, a, t) for a, row in costs.items() for t, c in row.items())
@@ -58,10 +58,10 @@ def assign_greedily(costs: Mapping[str, Mapping[str, float]], capacities: Mappin
 def improve_assignment(
     owners: Mapping[str, str], costs: Mapping[str, Mapping[str, int]], capacities: Mapping[str, int]
 ) -> dict[str, str]:
-    """Improve an assignment by moving tasks to other agents and swapping pairs while that lowers the total cost.
+    """Improve an assignment: move tasks to other agents and swap pairs of tasks as long as this lowers the total cost.
 
-    ``costs`` are by agent and task; an agent without a cost for a task cannot get it.  The passes recover most of the
-    gap between a greedy and an optimal assignment.
+    ``costs`` maps agent and task to the cost; a task is assigned only to agents with a cost for it.  The result is much
+    closer to an optimal assignment than the greedy one.
     """
     owner = dict(sorted(owners.items()))
     task_counts = Counter(owner.values())
@@ -85,7 +85,7 @@ def _move_task(
     capacity_left: dict[str, int],
     free: set[str],
 ) -> bool:
-    """Assign the task to the agent with the lowest cost among the agents with capacity left (``free``)."""
+    """Assign the task to the cheapest of the agents with remaining capacity (``free``), if that lowers the cost."""
     offers = [(costs[agent][task], agent) for agent in free if task in costs[agent]]
     now = owner[task]
     if not offers or min(offers)[0] >= costs[now][task]:
@@ -101,7 +101,10 @@ def _move_task(
 def _swap_task(
     task: str, owner: dict[str, str], costs: Mapping[str, Mapping[str, int]], known: Mapping[str, list[str]]
 ) -> bool:
-    """Swap the task for the one that lowers the total cost most; ``known`` has the tasks that each agent bid for."""
+    """Swap the task for the one that lowers the total cost most.
+
+    ``known`` contains the tasks that each agent bid for.
+    """
     own_agent = owner[task]
     row = costs[own_agent]
     least, best = 0, ""

@@ -1,7 +1,7 @@
-"""Group optimum: assign several tasks so that the total cost is minimal.
+"""Strategy ``group_optimal``: assign several tasks so that the total cost is minimal.
 
-One agent, a quorum member, gathers the reports and solves the problem for all.  At first each agent's cheapest tasks
-are considered; tasks that remain without an agent are solved again with all reports.
+In the first pass only the cheapest tasks of each agent are considered.  If tasks remain without an agent, the
+assignment is computed again, with all reports for these tasks.
 """
 
 from __future__ import annotations
@@ -20,19 +20,20 @@ from middleware.consensus.strategies import hungarian
 from middleware.consensus.strategy import Consensus, Report, standing
 
 FIRST_PASS_BIDS = 20
-"""Number of bids per agent in the first pass; that many fit into one datagram and lead to about 1 % above the optimum.
+"""Number of bids per agent in the first pass.  So many bids fit into one datagram, and the cost is about 1 % above the
+optimum.
 """
 
 
 class GroupOptimal(MultiTaskStrategy):
-    """The cheapest assignment that serves as many tasks as possible; for a single task the nearest agent."""
+    """The cheapest assignment of as many tasks as possible; a single task is assigned to the nearest agent."""
 
     name = "group_optimal"
     version = "1"
     bids = FIRST_PASS_BIDS
 
     def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
-        """Decide all items, sorted by task name."""
+        """Return one decision for each item, sorted by task id."""
         items = sort_items(items)
         slots = {item.task: item.slots for item in items}
         counted = [r for r in standing(contacts) if r.task in slots]
@@ -61,7 +62,7 @@ def select_cheapest(contacts: Iterable[Report], most: int) -> dict[tuple[str, st
 
 
 def _solve(rows: list[str], capacity_left: dict[str, int], bids: dict[tuple[str, str], int]) -> dict[str, list[str]]:
-    """Return the agents of each task; each agent at most once per task."""
+    """Return the agents of each task; no agent has two slots of the same task."""
     columns = [agent for agent, places in capacity_left.items() for _ in range(min(places, len(rows)))]
     of_agent: dict[str, list[int]] = {}
     for column, agent in enumerate(columns):

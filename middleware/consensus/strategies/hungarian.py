@@ -1,6 +1,6 @@
 """Solve the assignment problem exactly by shortest augmenting paths (Jonker and Volgenant, Computing 38, 1987).
 
-Costs are whole numbers, so sums are exact and every machine computes the same assignment.
+Costs are whole numbers, so their sums are exact, and every machine computes the same assignment.
 """
 
 from __future__ import annotations
@@ -8,16 +8,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 Costs = Sequence[Sequence[float]]
-"""Whole numbers; ``float`` instead of ``int`` while the sums are exact, for speed."""
+"""A matrix of whole numbers; they are ``float`` for speed if their sums are exact, otherwise ``int``."""
 INEXACT_SUM = 2**52
-"""From here on sums are not exact in floating point."""
+"""Sums of this size or larger may not be exact in floating point."""
 
 
 def solve(costs: Costs) -> list[int]:
-    """Return the column of each row.
+    """Return the column that is assigned to each row.
 
-    There are at least as many columns as rows, and all rows have the same length.  Of several optima the result is the
-    lexicographically first.
+    There must be at least as many columns as rows, and all rows must have the same length.  If there are several
+    optimal assignments, the result is the lexicographically first one.
     """
     if not costs:
         return []
@@ -29,8 +29,8 @@ def solve(costs: Costs) -> list[int]:
 def find_optimum(costs: Costs) -> tuple[list[int], list[float]]:
     """Return one optimal assignment and the price of each column.
 
-    Prices are at most 0, and 0 for columns without a row.  Each row's column minimises cost minus price for that row,
-    which proves optimality.
+    Prices are at most 0, and the price of a column without a row is 0.  The column of each row has the lowest cost
+    minus price in that row, which proves that the assignment is optimal.
     """
     wide = len(costs[0])
     prices: list[float] = [0 * costs[0][0]] * wide  # of the costs' type, so that integer sums stay exact
@@ -48,7 +48,7 @@ def find_optimum(costs: Costs) -> tuple[list[int], list[float]]:
 
 
 def _run_auction(costs: Costs, prices: list[float], owner: list[int], free: list[int]) -> list[int]:
-    """Let each free row bid for its best column (auction phase); returns the rows that remain free."""
+    """Let each free row bid for its best column (auction phase); return the rows that remain free."""
     unassigned: list[int] = []
     bids_left = len(free)
     free = free[::-1]
@@ -105,9 +105,9 @@ def _augment(costs: Costs, prices: list[float], owner: list[int], row: int) -> N
 
 
 def select_first_optimum(costs: Costs, columns: Sequence[int], prices: Sequence[float]) -> list[int]:
-    """Of all assignments of equal cost, return the lexicographically first one.
+    """Return the lexicographically first assignment with the same cost.
 
-    Each row in turn gets the lowest column that still leaves an optimal assignment for the rows after it.
+    Each row in turn gets the lowest column with which the whole assignment can still be optimal.
     """
     rows = len(columns)
     columns = [*columns, *sorted(set(range(len(prices))) - set(columns))]
@@ -116,7 +116,7 @@ def select_first_optimum(costs: Costs, columns: Sequence[int], prices: Sequence[
     for line, own in zip(costs, columns, strict=False):
         least = line[own] - prices[own]
         tight.append([c for c, (cost, price) in enumerate(zip(line, prices, strict=True)) if cost - price == least])
-    # A column without a row may be exchanged for any column with price 0 at no cost.
+    # A column without a row can be exchanged, without a change of cost, for any column with price 0.
     tight.append([column for column, price in enumerate(prices) if price == 0])
     for row in range(rows):
         for wanted in tight[row]:
@@ -126,7 +126,7 @@ def select_first_optimum(costs: Costs, columns: Sequence[int], prices: Sequence[
 
 
 def _exchange_columns(row: int, wanted: int, columns: list[int], owner: dict[int, int], tight: list[list[int]]) -> bool:
-    """Give ``wanted`` to ``row`` by a cycle of exchanges with later rows; returns False if there is no such cycle."""
+    """Give ``wanted`` to ``row`` by a cycle of exchanges with later rows; return False if there is no such cycle."""
     reached_from = {wanted: row}
     line = [wanted]
     rows = len(tight) - 1

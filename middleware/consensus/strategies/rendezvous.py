@@ -1,7 +1,7 @@
-"""Rendezvous: agree on a meeting place.
+"""Strategies that agree on a meeting place.
 
-``rendezvous`` is the mean of the agents' places, ``rendezvous_centre`` minimises the longest distance (1-centre) and
-``rendezvous_median`` the sum of distances (Weiszfeld 1937).  Each lies in the convex hull of the places.
+``rendezvous`` is the mean of the agents' positions, ``rendezvous_centre`` minimises the longest distance (1-centre) and
+``rendezvous_median`` the sum of distances (Weiszfeld 1937).  Each meeting place is in the convex hull of the positions.
 """
 
 from __future__ import annotations
@@ -13,12 +13,13 @@ from itertools import combinations
 from middleware.consensus.strategies.average import Average, Point, mean
 
 ITERATIONS = 200
-"""Iterations of the median, and of the centre in three dimensions; the same on every machine."""
+"""Number of iterations of the median, and of the centre in three dimensions.  It is fixed, so that all machines get the
+same result."""
 SLACK = 1e-9
 
 
 class Rendezvous(Average):
-    """The mean of the agents' places (``Report.value``)."""
+    """The mean of the agents' positions (``Report.value``)."""
 
     name = "rendezvous"
 
@@ -44,7 +45,10 @@ class Median(Average):
 
 
 def centre(points: Sequence[Point]) -> Point:
-    """Return the centre of the smallest enclosing circle; other than in two dimensions within 1 % of its radius."""
+    """Return the centre of the smallest enclosing circle or sphere.
+
+    In three dimensions, the error is at most 1 % of the radius.
+    """
     places = sorted(set(points))
     if len(places) == 1:
         return places[0]
@@ -68,7 +72,7 @@ def median(points: Sequence[Point], weights: Sequence[float]) -> Point:
     for _ in range(ITERATIONS):
         near = [w / max(math.dist(estimate, p), SLACK) for p, w in pairs]
         estimate = mean(places, near)
-    # If the median is one of the places, the iterations converge to it slowly.
+    # If the median is one of the points, the iterations converge slowly.
     return best if _total_distance(best, places, shares) <= _total_distance(estimate, places, shares) else estimate
 
 
@@ -96,7 +100,10 @@ def _contains(circle: tuple[Point, float], place: Point) -> bool:
 
 
 def _circumscribe(*places: Point) -> tuple[Point, float]:
-    """Return the circle through three points or on two as diameter; for collinear points on the two farthest apart."""
+    """Return the circle through three points, or the circle whose diameter is the line between two points.
+
+    For three collinear points, the diameter is the line between the two points that are farthest apart.
+    """
     if len(places) == 3:
         (ax, ay), (bx, by), (cx, cy) = places
         bx, by, cx, cy = bx - ax, by - ay, cx - ax, cy - ay

@@ -1,7 +1,7 @@
-"""Sequential auction: tasks are sold one after another to the agent whose route grows least.
+"""Strategy ``sequential``: tasks are auctioned one after another, each to the agent whose route grows least.
 
-Sequential single-item auctions under the MiniSum rule (Lagoudakis et al., RSS 2005): at most twice the optimal sum of
-route lengths.  Afterwards single tasks are moved while that shortens the sum.
+These are sequential single-item auctions under the MiniSum rule (Lagoudakis et al., RSS 2005).  The sum of the route
+lengths is at most twice the optimum.  Afterwards, single tasks are moved as long as this makes the sum shorter.
 """
 
 from __future__ import annotations
@@ -20,14 +20,17 @@ MIN_GAIN_M = 1e-9
 
 
 class Sequential(Cbba):
-    """Routes from each agent's position (``Report.value``) through its tasks; for a single task the nearest agent."""
+    """Routes from each agent's position (``Report.value``) through its tasks.
+
+    A single task is assigned to the nearest agent.
+    """
 
     name = "sequential"
     version = "1"
     reads = ("value",)
 
     def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
-        """Decide all items, sorted by task name; as ``cbba`` if agents or items have no positions."""
+        """Return one decision per item, sorted by task id; if agents or items have no positions, decide as ``cbba``."""
         items = sort_items(items)
         counted = [r for r in standing(contacts) if r.value]
         routes = plan_routes(contacts, items)
@@ -40,7 +43,8 @@ class Sequential(Cbba):
 def plan_routes(contacts: Sequence[Report], items: Sequence[Item]) -> dict[str, list[str]] | None:
     """Return each agent's tasks in the order of its route; None if agents or items have no comparable positions.
 
-    An agent whose reports name tasks takes only those tasks; an agent whose report names none takes any.
+    An agent whose reports are for certain tasks gets only these tasks; an agent whose report has no task can get any
+    task.
     """
     counted = [r for r in standing(contacts) if r.value]
     places = {item.task: item.position for item in items}
@@ -65,7 +69,7 @@ def compute_length(start: Place, route: Sequence[Place]) -> float:
 
 
 def find_insertion(start: Place, route: Sequence[Place], place: Place) -> tuple[float, int]:
-    """Return the smallest growth of a route by one more place, and the index of the place in the route."""
+    """Return the smallest growth of a route when ``place`` is inserted, and the index at which to insert it."""
     best = (math.dist(route[-1] if route else start, place), len(route))
     before = start
     for number, after in enumerate(route):
@@ -95,7 +99,7 @@ def _run_auction(
         _, agent, task, sold = heapq.heappop(bids)
         route = routes[agent]
         if task not in unsold or sold != len(route) or sold >= capacity_left[agent]:
-            continue  # bid made before the agent's route changed
+            continue  # the agent's route has changed since this bid
         route_places = [places[t] for t in route]
         route.insert(find_insertion(starts[agent], route_places, places[task])[1], task)
         unsold.discard(task)
@@ -115,7 +119,7 @@ def _improve_routes(
     capacity_left: Mapping[str, int],
     biddable: Mapping[str, set[str]],
 ) -> None:
-    """Move single tasks to where they cost less, and reverse route segments, until nothing improves."""
+    """Move single tasks to shorten the total length, and reverse route segments, until there is no improvement."""
     owners = {task: agent for agent, route in routes.items() for task in route}
     bidders: dict[str, list[str]] = {task: [] for task in sorted(owners)}
     for agent in routes:

@@ -1,4 +1,4 @@
-"""Weighted vote: the option with more than half of the total weight wins."""
+"""Strategy ``weighted_vote``: the option with more than half of the total weight wins."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from middleware.consensus.strategy import Consensus, Report, build_consensus, st
 
 
 class WeightedVote(Nearest):
-    """The newest vote of each agent counts with its weight; an agent that reports without a choice has not voted yet.
+    """A vote in which the newest vote of each agent has the agent's weight.
 
-    An option with more than half of the weight of all eligible agents wins at once: no other majority can exist,
-    whatever subset of reports a node has, provided that all reports name the same ``electorate``. If all agents have
-    voted without such a majority, the heaviest option wins; ties are broken by the lowest hash. The agent with the
-    lowest cost among the voters of the winning option acts.
+    An agent whose report has no choice has not voted yet. An option with more than half of the weight of all agents
+    that may vote wins immediately. No node can find a different majority, whatever subset of the reports it has, if all
+    reports contain the same ``electorate``. If all agents have voted without such a majority, the heaviest option wins;
+    ties are broken by the lowest hash. The agent with the lowest cost among the voters of the winning option acts.
     """
 
     name = "weighted_vote"
@@ -24,10 +24,10 @@ class WeightedVote(Nearest):
     reads = ("choice", "weight", "electorate")
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
-        """Decide; ``choice`` is "" while the vote is undecided."""
+        """Return the decision; its ``choice`` is "" as long as the vote is undecided."""
         counted = self.merge(contacts, ())
         if not counted:
-            return Consensus(None, strategy=self.name, reason="no report counts")
+            return Consensus(None, strategy=self.name, reason="no report is valid")
         present = math.fsum(r.weight for r in counted)
         all_weight = max(present, max(r.electorate for r in counted))
         weights: dict[str, float] = {}
@@ -38,13 +38,13 @@ class WeightedVote(Nearest):
         tally = ", ".join(f"{option}: {weight:g}" for option, weight in weights.items())
         is_decided = best != "" and (2.0 * weights[best] > all_weight or cast >= all_weight > 0.0)
         if not is_decided:
-            why = f"{tally or 'no vote'}; more than half of {all_weight:g} decides"
+            why = f"{tally or 'no vote'}; more than half of {all_weight:g} is needed"
             return build_consensus(self.name, (), counted, why)
         side = sorted((r for r in counted if r.choice == best), key=lambda r: (r.cost, r.agent))
         return build_consensus(self.name, side, counted, f"{best} of {tally}", choice=best)
 
     def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
-        """Return the newest vote of each agent, for the task whose id sorts first."""
+        """Return the report with the newest vote of each agent, for the task with the lowest id."""
         counted = standing((*a, *b), lambda report: -report.sequence)
         return tuple(r for r in counted if r.task == counted[0].task)
 

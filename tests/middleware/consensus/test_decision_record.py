@@ -117,8 +117,8 @@ class DecisionRecordTests(SynchronousTestCase):
         """If hysteresis keeps the previous agent in action, the record explains this."""
         acting = [member(1, 1.0, EXECUTING), member(2, 0.95), member(3, None)]
         for assigned, words in (
-            (1, "dog2 is the best, but not better by 10% than dog1, who acts"),
-            (2, "dog2 is better by more than 10% than dog1, who acted"),
+            (1, "dog2 is the best, but not more than 10% better than dog1, which acts"),
+            (2, "dog2 is more than 10% better than dog1, which acted before"),
         ):
             self.assertEqual(decided(3, acting, assigned=assigned).hysteresis, words)
         self.assertEqual(decided(1, THREE).hysteresis, "no agent acted before")
@@ -127,11 +127,11 @@ class DecisionRecordTests(SynchronousTestCase):
             "t1", 1, THREE[0], THREE[1:], "group_optimal", "1", found, found.assigned_agent, 0.1
         )
         self.assertEqual(shared.hysteresis, "no agent acted before; divided with 2 others among 3")
-        open_ = Consensus(None, reason="no vote; more than half of 3 decides")
+        open_ = Consensus(None, reason="no vote; more than half of 3 is needed")
         words = make_decision_record("t1", 1, THREE[0], THREE[1:], "weighted_vote", "1", open_, None, 0.1).hysteresis
-        self.assertEqual(words, "no vote; more than half of 3 decides")
+        self.assertEqual(words, "no vote; more than half of 3 is needed")
         self.assertIn("no agent is better", decided(2, [member(1, 0.5, EXECUTING), member(2, 0.7)]).hysteresis)
-        self.assertEqual(decided(1, [member(1, None)]).hysteresis, "no report counts")
+        self.assertEqual(decided(1, [member(1, None)]).hysteresis, "no report is valid")
 
     def test_decoder_is_total(self) -> None:
         """Any value of a record is decoded as a decision record or None, without an exception."""

@@ -92,7 +92,7 @@ class GroupOptimalTests(SynchronousTestCase):
         found = GroupOptimal().find_group(reports, [Item("s"), Item("t"), Item("u")])
         self.assertEqual([point.assigned_agent for point in found], ["a", None, None])
         self.assertEqual(found[1].reason, "all bidders have reached their capacity")
-        self.assertEqual(found[2].reason, "no agent bid for it")
+        self.assertEqual(found[2].reason, "no agent bid for the task")
 
     def test_equal_optima(self) -> None:
         """Of several optimal assignments the same one is always chosen."""

@@ -109,7 +109,7 @@ class ModuleTests(SynchronousTestCase):
         source = b"import sys; sys.modules['swarm_canary'] = sys"
         manifest = make_next_manifest("best", STRATEGY, b"x" * len(source), None)
         error = self.assertRaises(Undeployable, load_module, manifest, source)
-        self.assertIn("not what was signed", str(error))
+        self.assertIn("does not match the signed digest", str(error))
         self.assertNotIn("swarm_canary", sys.modules)
 
     def test_tracer_of_others_is_put_back(self) -> None:

@@ -119,7 +119,7 @@ class AuctionServiceTests(AuctionCase):
             around = replace(node.auction_service._environment, contacts=lambda: [known])
             node.auction_service._environment = around
         self.assert_agreed(fleet)
-        self.assertEqual(sum("send their bids here" in text for text in refused), len(outside) - 1 - 2)
+        self.assertEqual(sum("send their bids to this node" in text for text in refused), len(outside) - 1 - 2)
 
     def test_withdrawn_and_bid_anew(self) -> None:
         """A withdrawn bid does not count, and a new bid does; an unchanged bid is not sent again."""
@@ -191,7 +191,7 @@ class HostileTests(AuctionCase):
             forged = Announcement(99, rank, lie).sign(liar.entangled.identity.sign, auction)
             answer = self.ask(fleet, liar, victim, "bid.announce", auction.pack(), forged.pack())
             self.assertIsInstance(answer, Refused)
-            self.assertIn("no quorum member of the task made it", str(answer))
+            self.assertIn("not signed by a quorum member of the task", str(answer))
         fleet.run(2.0)
         for place in range(5):
             self.assertEqual(self.views[place][-1][0].agent, fleet.nodes[1].uuid)
