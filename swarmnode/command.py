@@ -14,10 +14,10 @@ OWN_PACKAGES = ("agents", "drivers", "formats", "middleware", "sim", "swarmnode"
 # Verbs without an installed module are not listed.
 VERB_MODULES: dict[str, tuple[str, str]] = {
     "demo": ("sim.demo.demonstration", "run a demo on this machine: three robots, a red target and the page"),
-    "yard": ("sim.robots.server", "run the robot simulator alone"),
+    "simulator": ("sim.robots.server", "run the robot simulator alone"),
     "trials": ("swarmnode.simulated_team", "repeat both experiments of the thesis"),
     "crowd": ("swarmnode.crowd", "simulate hundreds of agents and thousands of robots"),
-    "chaos": ("swarmnode.faults", "inject faults into a team, and measure the takeover"),
+    "faults": ("swarmnode.faults", "inject faults into a team, and measure the takeover"),
     "driver": ("swarmnode.driver.command", "find and test a robot before it joins a team"),
     "deploy": ("swarmnode.deploy", "push a strategy or behaviour to the team, show its state, roll it back"),
     "init": ("swarmnode.team.init", "create a closed team: operator key and first node"),
@@ -37,6 +37,8 @@ VERB_MODULES: dict[str, tuple[str, str]] = {
     "web": ("swarmnode.web_code", "show the address of the page and the sign-in code"),
     "password": ("swarmnode.password", "hash a password for the settings of the page"),
 }
+RENAMED_VERBS = {"yard": "simulator", "chaos": "faults"}
+"""Old names of verbs; accepted in version 0.2 with a warning."""
 NODE_VERBS = {
     "dht": "get, put, find, watch or remove records of the distributed hash table",
     "keyword": "publish, search, watch or remove keywords",
@@ -49,6 +51,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the verb in ``arguments``; returns its exit code."""
     words = sys.argv[1:] if arguments is None else arguments
     verb = words[0] if words else ""
+    if verb in RENAMED_VERBS:
+        sys.stderr.write(f"swarm: {verb} is now called {RENAMED_VERBS[verb]}; the old name will be removed\n")
+        verb = RENAMED_VERBS[verb]
     if verb in NODE_VERBS:
         # Fast path for requests to a running node: needs only the standard library.
         from middleware.entangled.control.command import main as command

@@ -1,4 +1,4 @@
-"""``swarm chaos``: inject faults into a running team, and measure the time of the takeover."""
+"""``swarm faults``: inject faults into a running team, and measure the time of the takeover."""
 
 from __future__ import annotations
 
@@ -90,12 +90,12 @@ def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line for one fault."""
     kinds = "\n".join(f"  {name:9}{kind.about}" for name, kind in KINDS.items())
     chaos = argparse.ArgumentParser(
-        prog="swarm chaos",
+        prog="swarm faults",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         description="Inject a fault into a device, and measure the time until another device takes over its task.",
-        epilog=f"kinds:\n{kinds}\n\nswarm chaos list: list the faults that each device supports.\n"
-        "swarm chaos run FILE: run a scenario; see swarm chaos run --help.\n\n"
-        "example: swarm chaos executing radio --seconds 10",
+        epilog=f"kinds:\n{kinds}\n\nswarm faults list: list the faults that each device supports.\n"
+        "swarm faults run FILE: run a scenario; see swarm faults run --help.\n\n"
+        "example: swarm faults executing radio --seconds 10",
     )
     chaos.add_argument("device", metavar="DEVICE", help='name, "executing" (a device that acts on a task) or "any"')
     chaos.add_argument("kind", metavar="KIND", help="kind of fault")
@@ -110,9 +110,9 @@ def make_parser() -> argparse.ArgumentParser:
 def make_scenario_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line for a scenario."""
     run = argparse.ArgumentParser(
-        prog="swarm chaos run",
+        prog="swarm faults run",
         description="Run a scenario: a file that lists faults and their times.",
-        epilog="Example: swarm chaos run examples/scenarios/takeover.toml --rehearse --seed 7",
+        epilog="Example: swarm faults run examples/scenarios/takeover.toml --rehearse --seed 7",
     )
     run.add_argument("file", metavar="FILE", type=Path, help="scenario, such as examples/scenarios/takeover.toml")
     run.add_argument("--rehearse", action="store_true", help="use a simulated team; equal seeds give equal runs")
@@ -148,9 +148,9 @@ def main(
                 return _run_simulated(scenario, options.seed, say)
         elif arguments[:1] == [LIST]:
             listing = argparse.ArgumentParser(
-                prog="swarm chaos list",
+                prog="swarm faults list",
                 description="List the faults that each device supports, and its active faults.",
-                epilog="Example: swarm chaos list --node dog1",
+                epilog="Example: swarm faults list --node dog1",
             )
             _add_common_arguments(listing)
             stage = TeamStage(ControlClient(listing.parse_args(arguments[1:]).node, ask), seconds, wait)
@@ -164,10 +164,10 @@ def main(
         stage = TeamStage(ControlClient(options.node, ask), seconds, wait)
         losses = run_scenario(scenario, scenario.seed if options.seed is None else options.seed, stage, say)
     except (BadFault, BadSetting, NoControl) as problem:
-        sys.stderr.write(remove_control_characters(f"swarm chaos: {problem}") + "\n")
+        sys.stderr.write(remove_control_characters(f"swarm faults: {problem}") + "\n")
         return EXIT_USAGE
     except (Rejection, DeviceNotPresent) as problem:
-        sys.stderr.write(remove_control_characters(f"swarm chaos: {problem}") + "\n")
+        sys.stderr.write(remove_control_characters(f"swarm faults: {problem}") + "\n")
         return EXIT_FAILED
     except KeyboardInterrupt:
         return EXIT_FAILED

@@ -34,8 +34,8 @@ EXIT_USAGE = 2
 def main(arguments: list[str] | None = None, output: TextIO = sys.stdout, errors: TextIO = sys.stderr) -> int:
     """Run a simulator until it is interrupted; return the exit code: 0, or 2 after an error message of one line."""
     parser = argparse.ArgumentParser(
-        prog="swarm yard",
-        description='Simulate robot dogs for the driver "sim" and for emulators.  Example: swarm yard --seed 7',
+        prog="swarm simulator",
+        description='Simulate robot dogs for the driver "sim" and for emulators.  Example: swarm simulator --seed 7',
     )
     parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default %(default)s)")
     parser.add_argument(
@@ -122,7 +122,7 @@ def _make_emulators(reactor: Any, seed: int, simulator: RobotSimulator, table: d
 
 
 def _print_error(errors: TextIO, problem: str) -> int:
-    print(f"swarm yard: {problem}", file=errors)
+    print(f"swarm simulator: {problem}", file=errors)
     return EXIT_USAGE
 
 

@@ -129,7 +129,9 @@ class SimulatorCommandTests(SynchronousTestCase):
             assert first.stdout is not None
             port = first.stdout.readline().split(" on ")[1].split(":")[1].strip()
             said = self.refusal("--port", port)
-            self.assertIn(f"swarm yard: cannot listen on 127.0.0.1:{port}: Address already in use; try another", said)
+            self.assertIn(
+                f"swarm simulator: cannot listen on 127.0.0.1:{port}: Address already in use; try another", said
+            )
         finally:
             first.kill()
             first.communicate()

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from swarmnode.command import main
+from swarmnode.command import RENAMED_VERBS, main
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -22,19 +22,28 @@ class CommandTests(SynchronousTestCase):
             output, complaint = io.StringIO(), io.StringIO()
             with contextlib.redirect_stdout(output), contextlib.redirect_stderr(complaint):
                 self.assertEqual(main(words), code)
-            for verb in ("demo", "yard", "trials", "deploy", "why", "dht", "tuple", "keyword", "rpc"):
+            for verb in ("demo", "simulator", "trials", "deploy", "why", "dht", "tuple", "keyword", "rpc"):
                 self.assertIn(verb, (complaint if code else output).getvalue())
         self.assertEqual((output.getvalue(), complaint.getvalue().count("\n")), ("", 1))
         self.assertIn("no verb 'fly'", complaint.getvalue())
 
     def test_each_verb_explains_itself(self) -> None:
         """Each verb has a help text."""
-        for verb in ("demo", "yard", "trials", "dht", "tuple", "keyword", "rpc"):
+        for verb in ("demo", "simulator", "trials", "dht", "tuple", "keyword", "rpc"):
             output = io.StringIO()
             with contextlib.redirect_stdout(output), self.assertRaises(SystemExit) as caught:
                 main([verb, "--help"])
             self.assertEqual(caught.exception.code, 0)
             self.assertIn("usage", output.getvalue())
+
+    def test_renamed_verbs_are_accepted(self) -> None:
+        """The old name of a verb runs the renamed one, after a warning with the new name."""
+        for old, new in RENAMED_VERBS.items():
+            output, complaint = io.StringIO(), io.StringIO()
+            with contextlib.redirect_stdout(output), contextlib.redirect_stderr(complaint):
+                self.assertRaises(SystemExit, main, [old, "--help"])
+            self.assertIn(f"usage: swarm {new}", output.getvalue())
+            self.assertIn(new, complaint.getvalue())
 
     def test_verb_without_its_libraries_names_the_extra(self) -> None:
         """A verb with missing libraries is rejected; the error contains the command that installs them."""

@@ -30,7 +30,7 @@ class ChaosTests(SynchronousTestCase):
         self.shell = Shell(self.virtual, self.virtual.services["vaio"].assembly.node)
 
     def chaos(self, line: str) -> tuple[int, str]:
-        """Run ``swarm chaos LINE`` in virtual time; return exit code and output."""
+        """Run ``swarm faults LINE`` in virtual time; return exit code and output."""
         clock = self.virtual.clock
 
         def command(words: list[str], out: Any, ask: Any) -> int:

@@ -59,7 +59,7 @@ class MemorySavingsTests(SynchronousTestCase):
             told = self.said(*words)
             self.assertNotIn(LOADED, told)
             self.assertNotIn("Traceback", told)
-        for verb in (("demo", "--help"), ("trials", "--help"), ("yard", *nowhere)):
+        for verb in (("demo", "--help"), ("trials", "--help"), ("simulator", *nowhere)):
             told = self.said("-c", f"from swarmnode.command import main; main({list(verb)!r})")
             self.assertNotIn(LOADED, told)
             self.assertNotIn("Traceback", told)
