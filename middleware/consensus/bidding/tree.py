@@ -34,8 +34,8 @@ time."""
 MAX_CHILDREN = 64
 """Maximum number of children of a node that is not a quorum member; further nodes use their next contact.
 
-Far more nodes know a node that joined early than other nodes.  Without this limit, 340 of 10,000 nodes would send their
-bids to the same early node near the key.
+A node that joined early is a contact of far more nodes than a node that joined late.  Without this limit, 340 of 10,000
+nodes would send their bids to the same early node near the key.
 """
 
 
