@@ -5,15 +5,16 @@ A node sends its certificate in the handshake of a session.  A certificate is on
 
 * ``[0, grant]``: the operator's grant.
 * ``[1, invite, wish, proof, name, not before, not after, signature, grant]``: an admission by invitation.  ``proof`` is
-  the invitation's signature over the newcomer's key and the name that the newcomer requested.  ``signature`` is that of
-  the bootstrap node, and ``grant`` is the operator's grant to that node with the role ``bootstrap``.  So neither a
-  bootstrap node alone nor the holder of a leaked code alone can admit a member.  * ``[2, name, not before, not after,
-  signature, gateway, pass]``: a guest, such as a visitor's phone.  A member with the role ``gateway`` signs it, for at
-  most a day; it becomes invalid when the gateway's own certificate ``pass`` does.  * ``[3, content, not before, not
-  after, signature, grant]``: a renewal of format 0 or 1.  ``content`` has the fields that the operator signed,
-  ``[grant]`` or ``[invite, wish, proof, name, admitter]``; the bootstrap node adds its ``signature`` and its ``grant``.
-  Name and roles follow from ``content``, so a renewal changes only the dates.  Only certificates that the operator
-  issued for ``DEFAULT_LIFE_S`` or longer are renewed, and only by bootstrap nodes that have such a certificate.
+  the invitation's signature over the newcomer's key and the name that the newcomer requested.  ``signature`` is the
+  signature of the bootstrap node, and ``grant`` is the operator's grant to that node with the role ``bootstrap``.  So
+  neither a bootstrap node alone nor the holder of a leaked code alone can admit a member.  * ``[2, name, not before,
+  not after, signature, gateway, pass]``: a guest, such as a visitor's phone.  A member with the role ``gateway`` signs
+  it, for at most a day; it becomes invalid when the gateway's own certificate ``pass`` does.  * ``[3, content, not
+  before, not after, signature, grant]``: a renewal of format 0 or 1.  ``content`` has the fields that the operator
+  signed, ``[grant]`` or ``[invite, wish, proof, name, admitter]``; the bootstrap node adds its ``signature`` and its
+  ``grant``.  Name and roles follow from ``content``, so a renewal changes only the dates.  Only certificates that the
+  operator issued for ``DEFAULT_LIFE_S`` or longer are renewed, and only by bootstrap nodes that have such a
+  certificate.
 """
 
 from __future__ import annotations
@@ -80,7 +81,7 @@ class Member:
 
     @property
     def is_renewable(self) -> bool:
-        """Whether bootstrap nodes may renew the certificate; those of guests and short-lived ones expire."""
+        """Whether bootstrap nodes may renew the certificate; guests' and short-lived certificates expire."""
         return self.life >= DEFAULT_LIFE_S and self.gateway is None
 
     @property

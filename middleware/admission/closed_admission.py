@@ -94,7 +94,7 @@ class ClosedAdmission:
 
     @property
     def own_pass(self) -> bytes:
-        """This node's certificate: the operator's latest grant, or that of its admission, with the latest renewal."""
+        """This node's certificate: the operator's latest grant, or its admission, with the latest renewal."""
         return self._membership_list.find_best_certificate(
             self._own_member, self._membership().certificate, self._wall()
         )

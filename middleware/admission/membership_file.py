@@ -1,7 +1,7 @@
 """Membership file of a member of a closed team: identity, certificate and team secrets.
 
-The file is secret: a person or program that has the file can act as this member.  A file that other users can read is
-rejected.  The file is replaced when the team's secret is rotated or the operator issues a new grant.
+The file is secret, because a holder of the file can act as this member.  A file that other users can read is rejected.
+The file is replaced when the team's secret is rotated or the operator issues a new grant.
 """
 
 from __future__ import annotations

@@ -100,7 +100,7 @@ class Renewal(SignedCertificate):
 
     @property
     def rank(self) -> int:
-        """The sort key: the renewal that ends later is valid, so no bootstrap node can shorten that of another."""
+        """The sort key: the renewal that ends later is valid, so no bootstrap node can shorten a renewal."""
         return self.member.not_after
 
 

@@ -1,6 +1,6 @@
 """Operator of a team: sign grants, invitations, revocations and secrets with a key kept in a file outside the nodes.
 
-The person who has the file is the operator.  Without the file, a team cannot invite or revoke members, so keep a copy.
+The holder of the file is the operator.  Without the file, a team cannot invite or revoke members, so keep a copy.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ LIST_NOTE = "admission/roll"
 GUESTS_NOTE, EMPTY_GUESTS = "admission/guests", bytes(msgpack.packb([]))
 """Name of the stored note with certificates of record owners that are not on the membership list."""
 MAX_GUESTS = 256
-"""Maximum number of owners whose certificates are stored; others are requested again from members."""
+"""Maximum number of stored certificates of owners; others are requested again from members."""
 
 
 class Team:
@@ -279,7 +279,7 @@ class Team:
             self._store.set_note(GUESTS_NOTE, noted)
 
     def _evict_revoked(self, public: bytes) -> None:
-        """Evict revoked members, including those that are offline."""
+        """Evict revoked members, including offline members."""
         if self._node is None:
             return
         for each in (public, *self.membership_list.invalidated):

@@ -80,8 +80,8 @@ class NodeSettings:
 
     membership: setting.MaybeFile = ""
     """Membership file of a closed team, relative to the folder of the settings file; each node needs its own.  ``swarm
-    init`` creates the first membership of a team, ``swarm join CODE`` that of a new member.  Empty: the team is open,
-    and ``team_key`` is required."""
+    init`` creates the first membership of a team, ``swarm join CODE`` the membership of a new member.  Empty: the team
+    is open, and ``team_key`` is required."""
 
     team_key: Annotated[str, Meta(min_length=1, max_length=1000), Secret()] = field(default="", repr=False)
     """Shared secret of an open team, used instead of a membership, for example in a classroom: any long text; it is
@@ -92,8 +92,9 @@ class NodeSettings:
     """Roles of the node: ``edge`` carries a device, ``bootstrap`` admits other nodes, ``web`` serves the page."""
 
     capabilities: setting.Capabilities = field(default_factory=dict)
-    """Capabilities of the device in addition to those of its driver; each is a table of properties (numbers or text).
-    If the driver has the same capability, the tables are merged, and the values in this setting take precedence."""
+    """Capabilities of the device in addition to its driver's capabilities; each is a table of properties (numbers or
+    text).  If the driver has the same capability, the tables are merged, and the values in this setting take
+    precedence."""
 
     presence_lease: Annotated[float, Meta(ge=0.1, le=60.0), Unit("seconds")] = 1.0
     """Seconds until other nodes consider a silent device lost.  A shorter time detects a loss sooner, but mistakes a
@@ -110,7 +111,7 @@ class NodeSettings:
     known node that is on a different machine.  Empty: no tunnel; the node cannot join where UDP is blocked."""
 
     tunnel_port: setting.Port = 0
-    """TCP port at which this node accepts tunnels from nodes whose UDP is blocked, preferably 443; 0: no tunnels."""
+    """TCP port at which this node accepts tunnels from nodes with blocked UDP, preferably 443; 0: no tunnels."""
 
     tunnel_tls: bool = True
     """False: the tunnel port does not use TLS and accepts only connections from this machine, for use behind a reverse
@@ -153,8 +154,8 @@ class DriverSettings:
 
     parts: setting.Parts = ()
     """Additional sensors on the robot, such as a camera board or a compass, at most 8.  Each is a table
-    ``[[driver.parts]]`` with ``kind`` and ``options``.  If the robot and a sensor have the same capability, that of the
-    robot takes precedence."""
+    ``[[driver.parts]]`` with ``kind`` and ``options``.  If the robot and a sensor have the same capability, the robot's
+    capability takes precedence."""
 
 
 @dataclass(frozen=True)
@@ -208,8 +209,8 @@ class DeploymentSettings:
 
     allow: bool = False
     """**The author of a behaviour controls the motion of this robot.**  The signature proves the author of a module,
-    not that the module is harmless.  The module runs in a separate process without privileges, as far as the operating
-    system supports this (``docs/how-to/push-code-to-a-team.md``).  False: modules are never fetched, loaded or run."""
+    not that the module is harmless.  The module runs in a separate process without privileges, if the operating system
+    supports this (``docs/how-to/push-code-to-a-team.md``).  False: modules are never fetched, loaded or run."""
 
     operators: setting.PublicKeys = ()
     """Public keys of the nodes that may push modules, each 64 hexadecimal digits; in a closed team these nodes also

@@ -25,7 +25,7 @@ from middleware.node import SwarmNode
 
 SETTINGS_METHOD, TUNE_METHOD = "device.settings", "device.tune"
 INVALID_SETTING = "setting"
-"""Code of a refusal whose text is ``KEY: problem; remedy``."""
+"""Code of a refusal with the text ``KEY: problem; remedy``."""
 NOTE_NAME = "tuning"
 
 

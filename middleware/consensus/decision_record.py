@@ -143,7 +143,7 @@ def decision_records_key(task: str) -> bytes:
 
 
 def decision_records_key_text(task: str) -> str:
-    """Return the string whose hash is that key, as used in the shell."""
+    """Return the string from which that key is derived, as used in the shell."""
     return f"task/{task}/why"
 
 

@@ -122,7 +122,7 @@ class GuardedStrategy:
         return answer
 
     def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
-        """Return a summary of the valid reports in ``a`` and ``b``; if the strategy fails, that of the fallback."""
+        """Return a summary of the valid reports in ``a`` and ``b``; if the strategy fails, the fallback's summary."""
         valid = _valid_reports((*a, *b))
         try:
             self._check_losses()
@@ -200,7 +200,7 @@ def check_group(found: Sequence[Consensus], contacts: Sequence[Report], items: S
 def decide_one_by_one(
     find: Callable[[Sequence[Report]], Consensus], contacts: Sequence[Report], items: Sequence[Item]
 ) -> tuple[Consensus, ...]:
-    """Decide the items one after another, sorted by task id; skip agents whose capacity is used up."""
+    """Decide the items one after another, sorted by task id; skip agents without remaining capacity."""
     counted = standing(contacts)
     capacity_left = find_capacities(counted)
     points = []

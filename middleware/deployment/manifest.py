@@ -20,7 +20,7 @@ from middleware.entangled.value import check_size, is_natural, parse_mapping
 DEPLOYMENTS = "deployments"
 NAME_PATTERN = r"[a-z][a-z0-9_-]{0,31}"
 MAX_SOURCE_BYTES = 256 * 1024
-"""Maximum size of a module's source in bytes; that of a strategy has a few thousand."""
+"""Maximum size of a module's source in bytes; a strategy has a few thousand bytes."""
 MAX_VERSION = 10**9
 MAX_PREVIOUS_EDITIONS = 4
 """Number of previous versions that a manifest lists for a rollback."""
@@ -54,8 +54,8 @@ class Manifest:
     def rank(self) -> tuple[int, int]:
         """The sort key of the manifests with one name: the manifest with the highest key is valid.
 
-        A higher version has a higher key.  The key of a rollback is above that of the version that it withdraws, and
-        below that of any higher version.  So a replayed old manifest has no effect.
+        A higher version has a higher key.  The key of a rollback is above the key of the version that it withdraws, and
+        below the key of any higher version.  So a replayed old manifest has no effect.
         """
         return (max(self.version, self.withdrawn), -self.version)
 

@@ -1,8 +1,8 @@
 """Messages and channel between a node and the process of a pushed module.  Pure.
 
 A request is ``[number, verb, arguments]`` and its reply ``[number, is_well, content]``, in msgpack with a 4-byte length
-prefix.  The node does not trust replies: it limits their size before parsing, and the number must be that of a pending
-request.
+prefix.  The node does not trust replies: it limits their size before parsing, and the number must be the number of a
+pending request.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ MAX_DIFFERENCES = 3
 
 @dataclass(frozen=True)
 class Difference:
-    """The difference between the decision of one agent and that of the majority."""
+    """The difference between the decision of one agent and the decision of the majority."""
 
     name: str
     what: str
@@ -30,10 +30,10 @@ class EpochExplanation:
 
     ``winner`` is the uuid of the agent that most agents chose (the lowest uuid if there is a tie), and ``chosen`` is
     its name.  ``agree`` are the names of the agents that chose it.  ``of`` is the number of participants; in a large
-    group, that of the agents that have to publish their decision.  ``differ`` lists the agents whose winner, strategy
-    or reports differ from those of most agents in ``agree``.  ``token`` is the winner's fencing token, 0 if unknown,
-    and ``agreed`` is the number, place or option that the strategy agreed on.  The other fields are from the records of
-    the majority.
+    group, the number of agents that have to publish their decision.  ``differ`` lists the agents whose winner, strategy
+    or reports differ from the values of most agents in ``agree``.  ``token`` is the winner's fencing token, 0 if
+    unknown, and ``agreed`` is the number, place or option that the strategy agreed on.  The other fields are from the
+    records of the majority.
     """
 
     epoch: int
@@ -118,7 +118,7 @@ def _get_basis(record: DecisionRecord) -> tuple[str, str, str]:
 
 
 def _describe_differences(record: DecisionRecord, reference: DecisionRecord, names: Mapping[str, str]) -> str:
-    """Return the differences between a decision record and that of the majority; empty if there are none."""
+    """Return the differences between a decision record and the record of the majority; empty if there are none."""
     differences = []
     if record.winner != reference.winner:
         differences.append(f"names {_find_name(record.winner, names)}")

@@ -127,8 +127,9 @@ def describe_team(node: SwarmNode) -> dict[str, Any]:
     """Return the team of ``node``; times are Unix timestamps.
 
     For an open team, ``unprotected`` describes the missing protection.  For a closed team, ``name`` is its name,
-    ``fingerprint`` is that of ``swarm doctor``, and ``me`` is the uuid of this node.  ``members`` contains the members
-    with their roles and the end of their certificates; members whose certificate ends within ``ENDING_S`` are first.
+    ``fingerprint`` is the fingerprint that ``swarm doctor`` prints, and ``me`` is the uuid of this node.  ``members``
+    contains the members with their roles and the end of their certificates; members whose certificate ends within
+    ``ENDING_S`` are first.
     """
     closed = node.team
     if closed is None:

@@ -1,7 +1,7 @@
 """Faults of one node's datagrams: loss, delay, duplication, and the loss of all datagrams in one direction or both.
 
-``FaultyNetwork`` wraps any other ``Network``.  Its faults of a real node's datagrams are those that the switchboard
-causes between simulated nodes.  Initially there are no faults.
+``FaultyNetwork`` wraps any other ``Network``.  It causes the same faults at a real node as the switchboard causes
+between simulated nodes.  Initially there are no faults.
 """
 
 from __future__ import annotations

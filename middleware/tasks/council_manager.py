@@ -141,5 +141,5 @@ def take_odd_number(members: Sequence[Contact]) -> tuple[Contact, ...]:
 
 
 def _count_tolerated_losses(responding: int, size: int) -> int:
-    """Return how many of the ``responding`` members may be lost so that a majority of ``size`` remains."""
+    """Return the number of ``responding`` members that may be lost so that a majority of ``size`` remains."""
     return responding - majority(size)

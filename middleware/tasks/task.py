@@ -61,7 +61,7 @@ class Task:
     - ``requirements``: the capabilities that a device must have, by name, with the minimum values of their properties
     - ``waiting_period``: seconds after the first report for which agents wait for more reports
     - ``lease_ttl``: seconds after which the lease of a silent holder expires
-    - ``hysteresis``: the share by which a report must be better than that of the acting agent to take over the task
+    - ``hysteresis``: the share by which a report must be better than the acting agent's report to take over the task
     - ``council``: the quorum members that grant the lease, fixed when the task is published; if the team is large
       enough, ``tolerates`` of them may fail at the same time
     - ``configuration``: the number of the configuration, which increases with each change of the quorum members
@@ -71,7 +71,7 @@ class Task:
     - ``deadline``: seconds after the task's creation (0: none)
     - ``stall_limit``: seconds without progress after which the lease is released (0: none)
     - ``stop_time``: seconds that the robot needs to stop
-    - ``value``: the value of the task, which strategies can compare with that of other tasks
+    - ``value``: the value of the task, which strategies can compare with the values of other tasks
     - ``generation``: a number that increases when an operator creates the task again
     - ``group``: tasks of one group are assigned together
     """

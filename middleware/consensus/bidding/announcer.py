@@ -154,7 +154,7 @@ class Announcer:
 
 
 def _drop_replaced(entries: tuple[AnnouncedReport, ...], summary: Summary) -> tuple[Report, ...]:
-    """Return the announced reports except those that a known bid has replaced."""
+    """Return the announced reports that no known bid has replaced."""
     current = []
     for entry in entries:
         known = summary.get(entry.report.agent)

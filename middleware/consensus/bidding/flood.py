@@ -1,4 +1,4 @@
-"""Flood bids from neighbour to neighbour as long as no quorum member is reachable; pure.
+"""Flood bids from neighbour to neighbour if no quorum member is reachable; pure.
 
 Only the bids for tasks without an exclusive lease are flooded.  Messages are not acknowledged; lost messages do no harm
 because each node has about eight neighbours.

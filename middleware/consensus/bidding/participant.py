@@ -101,7 +101,7 @@ class Participant:
             self._announcer.expected_bidders = bidders
 
     def make_bid(self, bid: Bid, path: str, now: float) -> None:
-        """Make or withdraw this node's own bid; ``path`` is that of ``path_choice``."""
+        """Make or withdraw this node's own bid; ``path`` is a path of ``path_choice``."""
         self._first_bid_at = min(self._first_bid_at, now)
         self.next_revision = max(self.next_revision, bid.revision + 1)
         is_direct = path == DIRECT
@@ -118,7 +118,7 @@ class Participant:
     def has_room(self, sender: Contact) -> bool:
         """Return whether this node accepts bids of ``sender``.
 
-        Quorum members accept bids of all nodes, other nodes those of a limited number of nodes.
+        Quorum members accept bids of all nodes, other nodes only bids of a limited number of nodes.
         """
         return self._announcer is not None or len(self.recipients) < MAX_CHILDREN or self.recipients.has(sender)
 

@@ -1,8 +1,8 @@
 """Reporters: the few participants of a task in a large team that write records; pure.
 
-In a small team each participant of a task writes a record and receives those of all others: n x n messages.  In a
+In a small team each participant of a task writes a record and receives the records of all others: n x n messages.  In a
 larger team all participants send bids to the quorum members, at constant cost per node, and only the reporters write
-records.  The reporters are the announced agents, and the agents that act or are about to act.  As long as there are few
+records.  The reporters are the announced agents, and the agents that act or are about to act.  If there are few
 records, other participants also become reporters, one after another.
 """
 
@@ -112,7 +112,7 @@ class Reporters:
 
 
 def make_reporters(uuid: str, key: bytes) -> Reporters:
-    """Return the reporters of the task whose group has the given ``key``, as known by the participant ``uuid``.
+    """Return the reporters of the task with the group key ``key``, as known by the participant ``uuid``.
 
     The nodes farthest from the key have the first turns, because the nearest nodes already store the records.
     """

@@ -1,7 +1,7 @@
 """The best bids of one auction that one node knows; pure.
 
 Adding bids is a join: their order and repetition make no difference.  Only the bid with the highest revision of each
-agent is used.  The auction's rule selects the *standing* bids, those that can affect the decision, and only these are
+agent is used.  The auction's rule selects the *standing* bids, which can affect the decision, and only these are
 forwarded.  A bid that replaced an earlier bid of its agent is kept and forwarded even if it is not standing; otherwise
 a delayed copy of the earlier bid would be selected again.
 """

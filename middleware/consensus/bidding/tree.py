@@ -2,8 +2,8 @@
 
 The node merges the bids of its children and sends them to its parent, a contact nearer to the key, which confirms them.
 If the parent does not answer, the node tries the next nearest contact, and finally the quorum members.  Nodes nearer to
-the key wait longer, so that they can forward all bids in one message.  The tree resembles that of Scribe, but its links
-are not stored.
+the key wait longer, so that they can forward all bids in one message.  The tree resembles the tree of Scribe, but its
+links are not stored.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ time."""
 MAX_CHILDREN = 64
 """Maximum number of children of a node that is not a quorum member; further nodes use their next contact.
 
-A node that joined early is known to far more nodes than others are.  Without this limit, 340 of 10,000 nodes would send
-their bids to the same early node near the key.
+A node that joined early is a contact of far more nodes than a node that joined late.  Without this limit, 340 of 10,000
+nodes would send their bids to the same early node near the key.
 """
 
 

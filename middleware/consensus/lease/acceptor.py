@@ -58,7 +58,7 @@ class LeaseAcceptor(Acceptor[str]):
 def may_evict(task_id: str, register: Register, now: float) -> bool:
     """Return whether a register may be evicted: its task ended, or its lease expired, long ago."""
     age = ENDED_AGE_S if register.is_closed else IDLE_AGE_S
-    # As long as the task is open, an evicted register would make an old configuration valid again.
+    # If the task is open, an evicted register would make an old configuration valid again.
     return max(register.lease_until, register.touched_at) + age <= now and (
         register.configuration == FIRST_CONFIGURATION or register.is_closed
     )

@@ -481,7 +481,7 @@ class LeaseClient:
         self._on_change()
 
     def _send_release(self, ballot: Ballot, heirs: Sequence[Contact] = ()) -> Deferred[object]:
-        """Release ``ballot`` at the council, and state for how long the robot may still move."""
+        """Release ``ballot`` at the council, and state the time for which the robot may still move."""
         rest = max(0.0, self._at_rest_at - self._clock.seconds())
         return self.proposer.release(ballot, heirs, rest * (1.0 + CLOCK_MARGIN))
 

@@ -1,7 +1,7 @@
 """The requests of a proposer to the council of a task, a majority of which grants the task's lease.
 
 The task's record contains the members of the council and its configuration, a number that increases with each change.
-Only a majority of the current council can change the council, and only as long as no lease is valid.  The ``charter``
+Only a majority of the current council can change the council, and only when no lease is valid.  The ``charter``
 contains the signatures of that majority, so a single member cannot make a proposer use a false council.
 """
 

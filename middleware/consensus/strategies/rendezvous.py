@@ -100,7 +100,7 @@ def _contains(circle: tuple[Point, float], place: Point) -> bool:
 
 
 def _circumscribe(*places: Point) -> tuple[Point, float]:
-    """Return the circle through three points, or the circle whose diameter is the line between two points.
+    """Return the circle through three points, or the circle with the line between two points as its diameter.
 
     For three collinear points, the diameter is the line between the two points that are farthest apart.
     """

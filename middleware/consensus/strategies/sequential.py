@@ -1,7 +1,7 @@
 """Strategy ``sequential``: tasks are auctioned one after another, each to the agent whose route grows least.
 
 These are sequential single-item auctions under the MiniSum rule (Lagoudakis et al., RSS 2005).  The sum of the route
-lengths is at most twice the optimum.  Afterwards, single tasks are moved as long as this makes the sum shorter.
+lengths is at most twice the optimum.  Afterwards, single tasks are moved until this no longer makes the sum shorter.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Sequential(Cbba):
 def plan_routes(contacts: Sequence[Report], items: Sequence[Item]) -> dict[str, list[str]] | None:
     """Return each agent's tasks in the order of its route; None if agents or items have no comparable positions.
 
-    An agent whose reports are for certain tasks gets only these tasks; an agent whose report has no task can get any
+    An agent that reports for certain tasks gets only these tasks; an agent that reports without a task can get any
     task.
     """
     counted = [r for r in standing(contacts) if r.value]

@@ -13,7 +13,7 @@ from middleware.consensus.strategy import Consensus, Report, build_consensus, st
 class WeightedVote(Nearest):
     """A vote in which the newest vote of each agent has the agent's weight.
 
-    An agent whose report has no choice has not voted yet. An option with more than half of the weight of all agents
+    An agent with a report without a choice has not voted yet. An option with more than half of the weight of all agents
     that may vote wins immediately. No node can find a different majority, whatever subset of the reports it has, if all
     reports contain the same ``electorate``. If all agents have voted without such a majority, the heaviest option wins;
     ties are broken by the lowest hash. The agent with the lowest cost among the voters of the winning option acts.
@@ -24,7 +24,7 @@ class WeightedVote(Nearest):
     reads = ("choice", "weight", "electorate")
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
-        """Return the decision; its ``choice`` is "" as long as the vote is undecided."""
+        """Return the decision; its ``choice`` is "" if the vote is undecided."""
         counted = self.merge(contacts, ())
         if not counted:
             return Consensus(None, strategy=self.name, reason="no report is valid")
