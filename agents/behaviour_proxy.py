@@ -74,7 +74,7 @@ class BehaviourProxy:
 
     @property
     def has_failed(self) -> bool:
-        """Whether the behaviour has failed; it is then not called any more."""
+        """Whether the behaviour has failed, so it is no longer called."""
         self._receive()
         return self._has_failed
 
