@@ -74,7 +74,7 @@ class BehaviourProxy:
 
     @property
     def has_failed(self) -> bool:
-        """Whether the behaviour has failed; then it is no longer called."""
+        """Whether the behaviour has failed, so it is no longer called."""
         self._receive()
         return self._has_failed
 

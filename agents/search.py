@@ -39,7 +39,7 @@ SIDESTEP_RADII = 2.0
 TOUCH_DISTANCE_M = 0.30
 """A bump counts as a bump into the target if the robot faces the target within this many metres."""
 TIGHT_TURN_RADII = 3.0
-"""A robot that cannot turn on the spot first backs off if the target is at its side, within this many circle radii."""
+"""A robot that cannot turn on the spot first backs off if a target to its side is within this many circle radii."""
 TARGET_MEMORY_S = 4.0
 """Seconds for which a target out of sight is assumed to stay: another dog may be passing."""
 HIDDEN_TARGET_MEMORY_S = 30.0

@@ -43,7 +43,7 @@ SKILL_TIMEOUT_S = 15.0
 MAX_MISSED_POLLS = 3
 """Missing answers after which an old value is dropped; if all polls fail, the driver asks for the version again."""
 BATTERY_POLL_PERIOD = 20
-"""Every how many polls the battery voltage is requested."""
+"""The battery voltage is requested in one of this many polls."""
 EMPTY_V, FULL_V = 6.8, 8.4
 """Voltages of the two lithium cells in series, empty and full."""
 

@@ -118,7 +118,7 @@ class RobotsTests(SimulatorCase):
             ({"dog1": {**aibo, "parts": [{"kind": "camera"}]}}, r"\[dog1\] an emulated camera needs the option url"),
             ({"dog1": {**aibo, "parts": [{"kind": "compass"}]}}, r"\[dog1\] part 1: .* option host .* or device"),
             ({"dog1": {**aibo, "dialct": "T2"}}, r"\[dog1\] has an unknown key 'dialct'; known are kind, options"),
-            ({"dog1": 7}, r"\[dog1\] must name a kind"),
+            ({"dog1": 7}, r"\[dog1\] must have a kind"),
         ]
         for table, problem in cases:
             with self.assertRaisesRegex(UsageError, problem):
@@ -132,7 +132,7 @@ class RobotsTests(SimulatorCase):
         table = {"dog1": {"kind": "create2", "options": {"port": str(path)}}}
         path.write_text("a device, or somebody's notes")
         robots = EmulatedRobots(MemoryReactorClock(), Random(1), self.simulator, table)
-        with self.assertRaisesRegex(UsageError, r"\[dog1\] .*ttyUSB0 is there already"):
+        with self.assertRaisesRegex(UsageError, r"\[dog1\] .*ttyUSB0 already exists"):
             robots.start()
         robots.stop()
         self.assertEqual(path.read_text(), "a device, or somebody's notes")

@@ -155,7 +155,7 @@ class CommandTests(SynchronousTestCase):
             (("--controller", "dance"), "invalid choice"),
             (("--agents", "3"), "run swarm crowd instead"),
             (("--picture", "/nowhere/at/all.svg"), "does not exist"),
-            (("--bodies", "121", "--room", "0.0677", "--seconds", "1"), "no place is free"),
+            (("--bodies", "121", "--room", "0.0677", "--seconds", "1"), "no position near the centre is free"),
         ):
             code, told = self.run_with(*words)
             self.assertEqual(code, 2, told)
