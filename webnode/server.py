@@ -222,11 +222,7 @@ def open_port(reactor: Any, host: str, port: int, factory: Any, setting: str) ->
     except CannotListenError as error:
         why = getattr(error.socketError, "strerror", None) or str(error.socketError)
         is_foreign = getattr(error.socketError, "errno", None) == errno.EADDRNOTAVAIL
-        remedy = (
-            "set host to an address of this machine"
-            if is_foreign
-            else f"set {setting} to another port, or to 0 for any free port"
-        )
+        remedy = "set host to an address of this machine" if is_foreign else f"choose another {setting}, or 0 for any"
         raise PortTaken(f"cannot serve the page on {host or '*'}:{port} ({why}); {remedy}") from error
     return opened
 

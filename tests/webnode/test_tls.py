@@ -202,7 +202,7 @@ class TlsPortTests(SynchronousTestCase):
         entrance._reactor = Taken()
         words = str(self.assertRaises(PortTaken, entrance.open, site_of(Data(b"hi", "text/plain"), Clock())))
         self.assertIn("127.0.0.1:8443", words)
-        self.assertIn("set tls_port to another port", words)
+        self.assertIn("choose another tls_port", words)
 
 
 class Line(StringTransport):
