@@ -73,7 +73,7 @@ class ActionPageTests(PageCase):
             else:
                 page.locator("#group").tap()
                 page.locator("#group").fill("yard")
-            page.locator("[data-can=with]", has_text="together with: Find and touch the red target.").wait_for()
+            page.locator("[data-can=with]", has_text="jointly with: Find and touch the red target.").wait_for()
             with page.expect_request(lambda asked: asked.method == "POST" and asked.url.endswith("/tasks")) as asked:
                 if type_on:
                     page.keyboard.press("Enter")

@@ -275,7 +275,7 @@ class PageTests(PageCase):
         self.view(page, "groups")
         self.assertEqual(page.locator(".point").inner_text(), "dog2 – 3 of 3 agree")
         self.assertEqual(page.locator(".cost").all_inner_texts(), ["1.04 m", "0.62 m", "1.37 m"])
-        self.assertEqual(page.locator(".choice").first.inner_text(), "names dog2, token 1 (waiting as number 1)")
+        self.assertEqual(page.locator(".choice").first.inner_text(), "chose dog2, token 1 (waiting as number 1)")
         self.view(page, "devices")
         shapes = [path.get_attribute("d") for path in page.locator("#devices .badge path").all()]
         self.assertEqual(len(set(shapes)), 3)

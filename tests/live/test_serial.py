@@ -57,7 +57,7 @@ class Create2PtyTests(TestCase):
         await driver.enable()
         self.port.close()
         await until(lambda: driver.state == "stale")
-        await until(lambda: "no such device" in driver.problem)
+        await until(lambda: "does not exist" in driver.problem)
         self.port = PtyPort(reactor, self.robot.accept, self.path)
 
         def obeys() -> bool:
@@ -85,7 +85,7 @@ class Create2PtyTests(TestCase):
         plain = self.mktemp()
         with open(plain, "wb"):
             pass
-        await self.named(plain, "no serial device")
+        await self.named(plain, "not a serial device")
         if os.geteuid() != 0:  # root may open every file
             os.chmod(os.path.realpath(self.path), 0)
             await self.named(self.path, "no permission")

@@ -105,7 +105,7 @@ class InjectorTests(SynchronousTestCase):
         self.assertEqual(self.asked("vaio")["kinds"], [kind for kind in KINDS if kind != "battery"])
         self.assertEqual(self.asked("dog1")["kinds"], list(KINDS))
         error = self.assertRaises(Rejection, self.stage.inject, self.named("vaio"), Fault("battery", 5.0, 0.01))
-        self.assertIn("cannot have battery; choose one of kill, freeze", str(error))
+        self.assertIn("does not support battery; choose one of kill, freeze", str(error))
         error = self.assertRaises(Rejection, self.stage.inject, self.named("dog1"), Fault("radio", 1e9))
         self.assertIn("seconds", str(error))
         error = self.assertRaises(Rejection, self.stage.assign, "fly")
