@@ -29,7 +29,7 @@ DOG = identity("dog")
 
 class CertificateTests(SynchronousTestCase):
     def test_granted_by_the_operator(self) -> None:
-        """A grant of the operator makes the key in it a member, and no other key."""
+        """A grant of the operator makes only the key in this grant a member."""
         shown = wrap_grant(granted(OPERATOR, "dog", "device", "gateway"))
         member = verify_certificate(OPERATOR.public, DOG.public, shown)
         self.assertEqual((member.name, member.roles), ("dog", ("device", "gateway")))
@@ -103,7 +103,7 @@ class CertificateTests(SynchronousTestCase):
         self.assertEqual(member.check_dates(member.not_after), "expired")
 
     def test_guest(self) -> None:
-        """A gateway can admit a guest for one day; a member without that role cannot, and a guest cannot."""
+        """A gateway can admit a guest for one day; a member that is not a gateway cannot, nor can a guest."""
         page, phone, friend = identity("page"), identity("phone"), identity("friend")
         own = wrap_grant(granted(OPERATOR, "page", "gateway"))
         shown = issue_guest_certificate(page, own, phone.public, "phone", NOW)

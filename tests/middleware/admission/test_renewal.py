@@ -90,7 +90,7 @@ class YearAndAHalfTests(YearsCase):
 
 class LargeTeamTests(YearsCase):
     def test_not_in_sight(self) -> None:
-        """In a large team a bootstrap node renews a member that is not a contact only if it finds it by a lookup."""
+        """In a large team a bootstrap node renews members that are not its contacts only if a lookup finds them."""
         years = self.years(bootstraps=1)
         vaio, dog, cat = years.houses[:3]
         years.close(cat, is_sudden=True)

@@ -75,7 +75,7 @@ class RouteTests(SynchronousTestCase):
 
 class PathChoiceTests(SynchronousTestCase):
     def test_goes_over_once(self) -> None:
-        """The choice between direct bids and the tree has a hysteresis."""
+        """The team size at which bids change between direct and tree has a hysteresis."""
         path_choice = PathChoice()
         paths = [
             path_choice.choose(n)
@@ -167,7 +167,7 @@ class BidderTests(SynchronousTestCase):
         self.assertEqual([offer.to for offer in again], [COUNCIL[2]])
 
     def test_new_bid_while_the_old_one_is_under_way(self) -> None:
-        """A confirmation applies to the bid that was sent, not to a newer bid."""
+        """A confirmation applies only to the bid that was sent; a newer bid of the agent remains unconfirmed."""
         self.participant.make_bid(bid(5, 2.0), DIRECT, 0.0)
         sent = offers(self.participant.take_due_messages(0.0))
         self.participant.make_bid(bid(5, 1.0, 1), DIRECT, 0.01)
@@ -321,7 +321,7 @@ class AnnouncerTests(SynchronousTestCase):
     def take(
         self, member: Participant, place: int, cost: float | None, now: float, revision: int = 0, shared: bool = True
     ) -> None:
-        """Let a council member receive the bid of the agent at ``place``."""
+        """Let a council member receive the bid of the agent with index ``place``."""
         member.on_offer([bid(place, cost, revision)], CONTACTS[place], 0.0, shared, now)
 
     def test_closes_after_the_waiting_period(self) -> None:
@@ -343,7 +343,7 @@ class AnnouncerTests(SynchronousTestCase):
         self.assertEqual(len(notices(self.first.take_due_messages(0.1))), 4)
 
     def test_next_member_stands_in(self) -> None:
-        """If the first member is silent, the second member announces, except after an announcement of the first."""
+        """If the first member is silent and has not announced, the second member announces."""
         self.take(self.second, 5, 2.0, 0.0)
         self.second.take_due_messages(0.6)
         self.assertIsNone(self.second.announcement)

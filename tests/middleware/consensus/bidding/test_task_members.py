@@ -103,7 +103,7 @@ class GroupTests(FleetCase):
         return groups
 
     def hearing(self, place: int) -> OnMembers:
-        """Return a callback that stores the members reported to the node at ``place``."""
+        """Return a callback that stores the members that are reported to the node with index ``place``."""
 
         def heard(members: list[Member], outcome: Result | None) -> None:
             self.heard[place].append(costs(members))
@@ -135,7 +135,7 @@ class GroupTests(FleetCase):
             self.assertEqual(self.heard[place][-1], {uuids[0]: None, uuids[1]: 2.0, uuids[2]: 3.0})
 
     def test_who_leaves_is_not_heard_of(self) -> None:
-        """When a member leaves, the others remove it, and it receives nothing more."""
+        """When a member leaves, the other members remove it, and it gets no further reports."""
         fleet = self.swarm(4)
         groups = self.groups(fleet)
         for place, group in enumerate(groups):
