@@ -44,7 +44,7 @@ class CertificateTests(SynchronousTestCase):
         self.assertEqual(member, Member(*expected, uses=1, since=NOW, life=invite.life))
 
     def test_renewed_by_a_bootstrap_node(self) -> None:
-        """A renewal postpones the expiry of a certificate, by grant or by code, and can itself be renewed."""
+        """A renewal postpones the expiry of a certificate from a grant or a join by code, and can be renewed itself."""
         vaio, grant = identity("vaio"), granted(OPERATOR, "vaio", "bootstrap")
         for shown in (wrap_grant(granted(OPERATOR, "dog")), admitted(OPERATOR, "dog")):
             before = verify_certificate(OPERATOR.public, DOG.public, shown)

@@ -38,7 +38,7 @@ def signer(name: str = "vaio", role: str = "bootstrap", code: JoinCode = CODE) -
 
 
 def welcomed(by: Signer | None = None) -> bytes:
-    """Return a join reply (JOIN_REPLY) that ``by`` signed; only the right bootstrap node makes it valid."""
+    """Return a join reply (JOIN_REPLY) signed by ``by``, or by default by the valid signer."""
     return join_codec.make_reply(INVITE.public, HEARD, JOIN_REPLY, by or signer(), random.Random(2))
 
 

@@ -23,7 +23,10 @@ class Years(Village):
             self.run(STEP_S)
 
     def end_of(self, house: House, at: int = 0) -> int:
-        """Return the expiry of the certificate of ``house`` in the membership list of the node with index ``at``."""
+        """Return when the certificate of ``house`` expires.
+
+        The date is read from the membership list of the node with index ``at``.
+        """
         member = self.houses[at].team.admission.find_member(house.public)
         assert member is not None
         return member.not_after

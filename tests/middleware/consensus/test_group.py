@@ -126,7 +126,7 @@ class CbbaTests(SynchronousTestCase):
         self.assertLessEqual(fmean(ratios), 1.05)
 
     def test_nothing_left_to_exchange(self) -> None:
-        """After the exchanges no single move or swap reduces the cost, and capacities are respected."""
+        """After the exchanges, no move of one task and no swap of two reduces the cost. Capacities are respected."""
         for seed in range(60):
             dice = random.Random(seed)
             tasks = [f"t{n}" for n in range(9)]

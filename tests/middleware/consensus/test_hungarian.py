@@ -21,7 +21,7 @@ class HungarianTests(SynchronousTestCase):
     def test_against_every_assignment(self) -> None:
         """The assignment has the lowest cost; of several such assignments it is the first.
 
-        This also applies to huge costs.
+        Both hold for huge costs, too.
         """
         dice = random.Random(1)
         for _ in range(400):

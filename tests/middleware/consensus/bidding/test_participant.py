@@ -135,7 +135,7 @@ class RecipientsTests(SynchronousTestCase):
         self.assertEqual(len(recipients.take_due_notices(announced(2, 0), True, now)), 1)
 
     def test_shared_listeners(self) -> None:
-        """A bidder that sent its bid to the whole council gets an announcement only from the member that made it."""
+        """A bidder that sent its bid to the whole council gets an announcement only from its author."""
         recipients = Recipients()
         recipients.add(CONTACTS[5], is_shared=True)
         self.assertEqual(recipients.take_due_notices(announced(1, 1), False, 0.0), [])

@@ -45,7 +45,7 @@ class ReportersTests(SynchronousTestCase):
         self.assertEqual(self.reporters.compute_due(replace(ME, why="waits"), 0.1), 0.1)
 
     def test_turn_comes_while_there_are_few(self) -> None:
-        """In a larger group, an agent without a decision writes at its turn, unless enough others have written."""
+        """In a larger group an agent that is not chosen writes at its turn, unless enough others have written."""
         self.reporters.on_records(OTHERS, MAX_SMALL_TEAM + 1, 0.0)
         self.assertEqual((self.reporters.is_partial(0.0), self.reporters.compute_due(ME, 0.0)), (True, math.inf))
         reporters = Reporters("me", 0.5)

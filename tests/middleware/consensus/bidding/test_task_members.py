@@ -66,7 +66,10 @@ class TaskMembersTests(SynchronousTestCase):
         self.assertEqual(self.task_members.list_awaited(), [])
 
     def test_announced_before_the_record(self) -> None:
-        """A bid announced before the agent's record arrives counts when it arrives, until the record changes."""
+        """If a bid is announced before the agent's record arrives, the bid counts as soon as the record has arrived.
+
+        A later change of the record overrides the bid.
+        """
         self.task_members.update_announced([Report("c", 0.5)])
         self.assertEqual(self.task_members.list_awaited(), [Report("c", 0.5)])
         here = [member("a", 3.0), member("b", None)]

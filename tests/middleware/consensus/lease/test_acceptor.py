@@ -94,7 +94,7 @@ class AcceptorTests(SynchronousTestCase):
         self.assertEqual(self.propose(2, "b", 2, 1.2).kind, ReplyKind.GRANTED)
 
     def test_change_by_the_holder(self) -> None:
-        """A holder that changes the council keeps others away for one TTL, also at members of the next council."""
+        """If a holder changes the council, no member of the old or the next council grants to others for one TTL."""
         self.prepare(1, "a", 0.0)
         self.propose(1, "a", 1, 0.0)
         self.prepare(2, "a", 0.1)
@@ -233,7 +233,7 @@ class AcceptorTests(SynchronousTestCase):
         self.assertEqual(self.prepare(1, "b", 51.0).kind, ReplyKind.QUIET)
 
     def test_forgotten(self) -> None:
-        """An evicted task leaves a lower bound for later ballots and tokens, also after a restart."""
+        """After a task was evicted, a lower bound for later ballots and tokens remains, also after a restart."""
         self.patch(acceptor_log, "MAX_REGISTERS", 1)
         store = MemoryStore()
         self.acceptor = LeaseAcceptor(store, -math.inf)

@@ -33,7 +33,7 @@ class LeaseProposerTests(LeaseCase):
         self.assertEqual(self.token(1), 2)
 
     def test_who_knows_the_old_council_is_told(self) -> None:
-        """Any member, even a former member, redirects a client that has an old council record."""
+        """A client that only knows the old council is redirected by any member, even by a former one."""
         self.assertIsNone(self.change(1, 0, 1, 2))
         self.assertEqual(self.places(2), [0, 1, 2])
         self.room.charters[T] = replace(self.room.charters[T], changes=())
