@@ -1,4 +1,4 @@
-"""An admission check for tests that records each peer that it checks."""
+"""An admission check for tests, which records the peers that it has checked."""
 
 from __future__ import annotations
 

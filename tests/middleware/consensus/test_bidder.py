@@ -83,7 +83,7 @@ class BidderTests(SynchronousTestCase):
             self.assertEqual(winners, expected)
 
     def test_warped(self) -> None:
-        """With scores that grow with the bundle, bids do not increase within a bundle, and all bidders converge."""
+        """Even if scores grow with the size of the bundle, bids never increase in it, and all bidders converge."""
         for seed in range(40):
             dice = random.Random(seed)
             names, goals = [f"a{n}" for n in range(5)], [f"t{n}" for n in range(6)]

@@ -161,7 +161,7 @@ class GuardedStrategyTests(SynchronousTestCase):
             self.assert_falls_back(GuardedStrategy(Lying(lie)), why)
 
     def test_mutable_state(self) -> None:
-        """A strategy that returns two results for equal reports is detected in the same or the next call."""
+        """If a strategy gives different results for equal reports, this is detected in the same or the next call."""
         self.assert_falls_back(GuardedStrategy(Moody(), twice=True), "different results")
         later = GuardedStrategy(Moody())
         self.assertEqual(later.find(TEAM).assigned_agent, "b")

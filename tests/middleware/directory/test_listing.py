@@ -137,7 +137,7 @@ class ListingTests(SynchronousTestCase):
         self.assertLessEqual({o for o in depths if under.has(derive_node_id(o))}, {r.owner for r in listing.records})
 
     def test_what_is_open_is_not_over(self) -> None:
-        """If an answer is pending, the listing is neither over nor complete."""
+        """While the answer to a read is pending, the listing is neither over nor complete."""
         listing = Listing(1)
         self.assertFalse(listing.is_over)
         self.assertEqual(listing.take_next(), ROOT)

@@ -34,7 +34,7 @@ class FaultyNetworkTests(SynchronousTestCase):
     def test_changes_nothing_as_made(self) -> None:
         """Without a fault all datagrams pass immediately in both directions.
 
-        The address of the inner network is used.
+        Both networks have the same address.
         """
         self.assertEqual(self.network.address.host, "127.0.0.1")
         self.assertEqual(self.exchange(0.0, 20), (20, 20))

@@ -94,9 +94,9 @@ class LogTests(SynchronousTestCase):
         self.assertEqual(again.floor[:2], (40, 40))
 
     def test_changed_councils_are_not_forgotten(self) -> None:
-        """The register of a changed council is kept while its task is open.
+        """The register of a council that was replaced is kept while its task is open.
 
-        Otherwise the old council could decide again.
+        Without the register the old council could decide again.
         """
         self.patch(module, "MAX_REGISTERS", 1)
         granted(self.log, "t", 1, 0.0).configuration = FIRST_CONFIGURATION + 1

@@ -35,7 +35,7 @@ class AcceptorTests(SynchronousTestCase):
         return self.acceptor.lease("t", configuration, ballot(number, agent), token, TTL, now)
 
     def test_promise_for_the_time_after_a_lease(self) -> None:
-        """Near the end of a lease another proposer gets a promise for the time after it, but no earlier grant."""
+        """Near the end of a lease another proposer gets a promise for the time after this end, but no grant."""
         self.prepare(1, "a", 0.0)
         self.propose(1, "a", 1, 0.0)
         self.assertEqual(self.prepare(2, "b", 1.5).kind, ReplyKind.HELD)

@@ -125,7 +125,7 @@ class LeaseClientTests(LeaseCase):
             self.assertEqual(self.room.nodes[place].acceptor.log.get(T).holder, first)  # type: ignore[union-attr]
 
     def test_stand_by_that_is_named(self) -> None:
-        """A standby that then claims the lease gets it; a holder that gets a rank as standby keeps its lease."""
+        """A client with a rank as standby can claim a free lease; a holder that gets such a rank keeps its lease."""
         self.client(0).stand_by(3)
         self.client(0).claim()
         self.run_for(2 * TTL)

@@ -43,7 +43,7 @@ class LeaseProposerTests(LeaseCase):
         self.assertEqual((self.places(0), self.holders()), ([0, 1, 2], [0]))
 
     def test_member_that_was_away_is_told(self) -> None:
-        """A new member that was unreachable during the change learns of the change from the next claiming client."""
+        """If a new council member was unreachable during the change, the next client that claims informs it."""
         self.cut(6, *range(6))
         self.assertIsNone(self.change(1, 3, 4, 6))
         self.room.radio.cut.clear()

@@ -239,7 +239,7 @@ class RuleTests(LeaseCase):
             self.assertEqual(self.room.recorder.violations, [])
 
     def test_rule_11_suspicion_shortens_no_lease(self) -> None:
-        """If a standby suspects the holder, the lease does not end earlier; the standby is ready when it ends."""
+        """A standby that suspects the holder does not shorten the lease, but is ready when the lease ends."""
         self.wanting(0)
         self.client(1).stand_by()
         for _ in range(40):
