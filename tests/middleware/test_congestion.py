@@ -51,7 +51,7 @@ class LongWayTests(EndpointCase):
         self.switchboard.conditions = LinkConditions(FAR)
 
     def test_one_handshake_is_enough(self) -> None:
-        """Concurrent requests in both directions wait for one handshake; no second handshake is started."""
+        """Concurrent requests in both directions wait for the same handshake, and start no second one."""
         self.got(self.a.ask(self.to_b, "add", 1))
         self.got(self.b.ask(self.to_a, "add", 2))
         self.got(self.a.ask(self.to_b, "add", 3))
@@ -139,7 +139,7 @@ class RoughWeatherTests(EndpointCase):
         self.switchboard.conditions = LinkConditions(DELAY, loss=0.3)
         self.answered(100, 1.0)
         self.assertGreater(self.a.peers.tries, MAX_TRIES)
-        self.assertGreaterEqual(self.answered(500, 1.0), 498)  # about 466 with four tries
+        self.assertGreaterEqual(self.answered(500, 1.0), 498)  # with four tries about 466 requests would be answered
 
     def test_the_first_contact_as_well(self) -> None:
         """Handshakes are also retransmitted according to the loss rate."""

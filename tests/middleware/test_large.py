@@ -74,7 +74,7 @@ class LargeTests(FleetCase):
         return self.done(fleet, node.find_node(target), 2.0)
 
     def test_a_lookup_finds_who_let_go_of_the_session(self) -> None:
-        """Lookups over slow paths are exact even if some nodes have closed sessions that their peers still use."""
+        """Lookups over slow paths find the closest nodes, even if nodes closed sessions that their peers still use."""
         fleet = self.large(weather=LinkConditions(0.08))
         node, target = fleet.nodes[0], self.far(fleet.nodes[0]).node_id
         others = [other.contact for other in fleet.nodes[1:]]
@@ -152,7 +152,7 @@ class LargeTests(FleetCase):
         far = [contact.node_id for contact in node.overlay.contacts() if contact.node_id not in near]
         self.assertTrue(far and all(asked[node_id] <= 5 for node_id in far), asked)
         self.assertGreater(sum(asked[node_id] for node_id in far), 0)
-        self.assertFalse(any(each.overlay.is_complete for each in fleet.nodes))  # the contacts are only some nodes
+        self.assertFalse(any(each.overlay.is_complete for each in fleet.nodes))  # no node knows all nodes
         routed = self.far(node)
         node._membership.prober.needs_keep_alive = lambda contact: contact == routed
         asked.clear()

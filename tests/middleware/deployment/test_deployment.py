@@ -193,7 +193,7 @@ class DeploymentTests(FleetCase):
         self.assertNotIn("\x1b", "".join(text for _, text in self.dog.presence.device.messages))
 
     def test_restart_loads_from_the_shelf(self) -> None:
-        """After a restart the accepted version runs without any peer; the store contains two editions."""
+        """After a restart the accepted version runs without any peer; the store contains it and the previous one."""
         held = None
         for number in (1, 2, 3):
             held, source = self.version(number, held)

@@ -87,7 +87,7 @@ class ListingTests(SynchronousTestCase):
             self.assertEqual(len(listed(announced(depths), Listing(floor)).records), 620)
 
     def test_some_know_sooner_that_the_team_is_small(self) -> None:
-        """If most of 40 devices have returned to the root key, the others, up to two depths below, are still listed."""
+        """If most of 40 devices have returned to the root key, devices at up to two depths below are still listed."""
         team = owners(40)
         for deep in (1, 2):
             depths = {owner: deep if derive_node_id(owner)[0] >> 7 != DEVICES[0] >> 7 else 0 for owner in team}

@@ -95,7 +95,7 @@ class LossyLinkTests(SitesCase):
                     self.assertEqual((one, other, path), (one, other, "direct"))
 
     def test_late_words(self) -> None:
-        """If one side is notified half a second late, the pair is relayed at first, and later has a direct path."""
+        """If one peer is notified half a second late, the pair is relayed at first, and later has a direct path."""
         for one, other in (("leaky", "port"), ("port", "leaky")):
             for late in "ab":
                 sites = self.sites()
