@@ -519,7 +519,7 @@ class MemberTests(FleetCase, LogCase):
         self.failureResultOf(stored, NoAnswer)
 
     def test_a_recording_parts_nobody(self) -> None:
-        """A recorded INIT with an expired credential is rejected; its sender keeps its membership and leases."""
+        """A replayed INIT with an expired credential is rejected; the member that it names keeps its leases."""
         fleet = self.gated(3)
         init = [d for d, to in self.recorded(fleet, 2) if d[0] == INIT][0]
         self.done(fleet, fleet.nodes[2].put(KEY, "here", b"2", "leased"))

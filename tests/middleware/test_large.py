@@ -278,7 +278,7 @@ class LargeTests(FleetCase):
         self.assertEqual({len(node.overlay.members) for node in fleet.nodes[:8]}, {7})
 
     def test_values_are_kept(self) -> None:
-        """After a quarter of the nodes failed, a stored record is readable, and the new closest nodes store it."""
+        """After a quarter of the nodes failed, a record is still readable, and is stored by the closest nodes left."""
         fleet = self.large()
         key = fleet.nodes[2].identity.node_id
         self.assertGreaterEqual(self.done(fleet, fleet.nodes[1].put(key, "a", b"1"), 2.0), 5)

@@ -47,7 +47,7 @@ PATCHED = (
 # These tables have separate limits, which are larger than ``CROWD``.
 OTHERS: tuple[str, ...] = ("_members", "_listed_at", "_requests", "_peers", "sessions", "_responses", "_unconfirmed")
 OTHERS += ("_contacts", "_store", "_entries", "_live", "_absent")
-OTHERS += ("_switchboard._names", "_switchboard._untraced")  # These tables belong to the simulation.
+OTHERS += ("_switchboard._names", "_switchboard._untraced")  # These tables belong to the simulation, not to a node.
 
 
 class PageTests(FleetCase):

@@ -75,7 +75,7 @@ class LookupTest(SynchronousTestCase):
             self.assertEqual((lookup.take_next(), lookup.closest()), ([], []))
 
     def test_slow_frees_its_place(self) -> None:
-        """A slow contact permits further queries.
+        """While a contact is slow to reply, the lookup queries further contacts.
 
         The lookup still waits for this contact, and replaces it if it fails.
         """

@@ -28,7 +28,7 @@ class NodeCase(FleetCase):
         return [record.value for record in self.done(fleet, fleet.nodes[place].get(key), within)]
 
     def watched(self, node: EntangledNode, **options: Any) -> list[list[bytes | None]]:
-        """Return a list that will contain all notifications of a watch."""
+        """Start a watch; return a list that will contain all its notifications."""
         told: list[list[bytes | None]] = []
         node.watch(KEY, lambda records: told.append([r.value for r in records]), **options)
         return told
@@ -164,7 +164,7 @@ class LeaseTests(NodeCase):
     def test_short_silence_ends_no_lease(self) -> None:
         """A partition of half a lease removes no leased record.
 
-        A longer partition does, and the records return after it.
+        A longer partition removes them, and they return when the partition ends.
         """
         fleet = self.fleet(3)
         fleet.nodes[2].put(KEY, "state", b"here", "leased")
@@ -322,7 +322,7 @@ class KeepTests(NodeCase):
         self.page, self.dog = self.order[-1], self.order[-2]
 
     def test_copies_follow_what_is_seen(self) -> None:
-        """If a node watches with ``keep``, it has the key's records in its store even if it is not a holder."""
+        """A node that watches a key with ``keep`` has the key's records in its store, even if it is not a holder."""
         store = self.page.store
         self.dog.put(KEY, "state", b"here", "leased")
         self.world.run(1.0)
@@ -443,7 +443,7 @@ class JoinTests(NodeCase):
         self.assertEqual(len(fleet.nodes[0].overlay.table), 1)
 
     def test_known_to_oneself_only(self) -> None:
-        """If the only known node of a bootstrap node is its own address, it is the first node of its network."""
+        """A bootstrap node that knows only its own address becomes the first node of its network."""
         fleet = self.fleet(1)
         node = fleet.make_node(1)
         fleet.nodes.append(node)

@@ -76,7 +76,7 @@ class OverlayTests(FleetCase):
         self.assertEqual(seen, [other] * 3 + [moved])
 
     def test_the_found_are_kept_in_mind(self) -> None:
-        """A contact in the routing table that is offline does not displace holders that a lookup has found."""
+        """An offline contact in the routing table does not displace holders that a lookup has found."""
         fleet = self.fleet(14, seed=2)
         node, key = fleet.nodes[0], hash_key("a")
         node.overlay.has_all_members = False
@@ -150,7 +150,7 @@ class NewcomerTests(SynchronousTestCase):
         return Deferred.fromCoroutine(self.overlay.wait_for_members())
 
     def look(self, work: Deferred[Any], news: Callable[[], None], step: float) -> bool:
-        """Return whether ``work``, which is waiting, ends at the first check after ``news``."""
+        """Check that ``work`` waits. Then call ``news``, and return whether ``work`` ends at the next check."""
         self.clock.advance(3.5 * step)
         self.assertNoResult(work)
         news()
@@ -173,7 +173,7 @@ class NewcomerTests(SynchronousTestCase):
     def test_meeting_waits_for_the_team(self) -> None:
         """``met`` waits for the complete member list, or the knowledge that the team is large.
 
-        One member is not enough.
+        To hear one member is not enough.
         """
         for news in (self.knows_all, self.knows_many):
             self.forget()

@@ -151,7 +151,7 @@ class CorruptFileTest(SynchronousTestCase):
                 self.assertEqual([r for r in store.records() if r.value != bytes(500)], [])
                 self.assertIn(store.get_note("identity"), (DOG.seed, None))
                 seen.add(f"{store.origin}, {store.corrupt_rows > 0}")
-                # If a record were lost without a report, it would seem that it had never been written.
+                # A record that is lost without a report would look as if it had never been written.
                 lost = 200 - len(store)
                 self.assertTrue(
                     not lost or store.origin == "replaced" or store.corrupt_rows >= lost, (lost, store.corrupt_rows)

@@ -53,7 +53,7 @@ class StoreContract(_Case):
         self.store = self.make(100)
 
     def test_empty(self) -> None:
-        """A new store reports that it is new and is empty."""
+        """A new store is empty, and reports that it is new."""
         self.assertEqual((self.store.origin, self.store.corrupt_rows, len(self.store.epoch)), ("new", 0, 8))
         self.assertEqual(len(self.store), 0)
         self.assertEqual(self.store.get(KEY), [])
@@ -161,7 +161,7 @@ class StoreContract(_Case):
         self.assertRaises(Full, store.put, record("c", value=bytes(600)), FOREVER)
 
     def test_one_owner_leaves_as_much_as_it_has(self) -> None:
-        """An owner may use half of the free rows and bytes, and in any case a small number."""
+        """An owner may use half of the free rows and bytes, and always a small minimum of them."""
         for rows, octets, value in ((1000, MAX_BYTES, b""), (10_000, 1_000_000, bytes(10_000))):
             store = self.make(rows, octets)
             shares = [self.fill(store, owner, value) for owner in (DOG, CAT)]

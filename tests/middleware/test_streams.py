@@ -89,7 +89,7 @@ class StreamsTests(EndpointCase):
         self.assertEqual(self.switchboard.counters["sent"], sent)
 
     def test_lost_part_drops_the_frame(self) -> None:
-        """A frame with a lost fragment is dropped, and so is an older frame that arrives late.
+        """A frame with a lost fragment is dropped; an older frame that arrives late is dropped, too.
 
         No frame is shown twice.
         """

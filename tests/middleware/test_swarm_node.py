@@ -163,7 +163,10 @@ class SwarmNodeTests(FleetCase):
             self.failureResultOf(asked, Refused)
 
     def test_operator(self) -> None:
-        """A message from an operator is delivered and shown; a disconnect order is executed after its reply."""
+        """A message from an operator is delivered and shown.
+
+        A device replies to a disconnect order and then executes it.
+        """
         fleet = self.swarm(2)
         texts: list[str] = []
         gone: list[float] = []
@@ -198,7 +201,7 @@ class SwarmNodeTests(FleetCase):
         self.assertEqual(gone, [])
 
     def test_contact_of(self) -> None:
-        """``contact_of`` returns the announced address of a device, and None for an invalid one."""
+        """``contact_of`` returns the announced address of a device, or None if this address is invalid."""
         fleet = self.swarm(1)
         node: SwarmNode = fleet.nodes[0]
         rows = {

@@ -224,7 +224,7 @@ class TunnelTests(TunnelCase):
         self.assertEqual(server.peers, [])
 
     def test_port_in_use(self) -> None:
-        """A port in use raises ``PortInUse``, and a joint network then opens neither of its networks."""
+        """A port in use raises ``PortInUse``; then a network that joins UDP and tunnels opens neither of them."""
         self.made()
         stream = self.pipes.make_transport(HOST, 443)
         other = TunnelNetwork(stream, self.clock, random.Random(1), is_served=True)
@@ -261,7 +261,7 @@ class TunnelTests(TunnelCase):
 
 
 class QueueLimitTests(TunnelCase):
-    """Tests of the load on a tunnel server by slow readers, incomplete handshakes and strangers."""
+    """Tests of a tunnel server under load by slow readers, incomplete handshakes and unknown peers."""
 
     def test_slow_reader(self) -> None:
         """For a peer that does not read, at most 64 KiB are queued, and the newest datagrams are dropped."""
@@ -386,7 +386,7 @@ class QueueLimitTests(TunnelCase):
         self.assertEqual((len(client.peers), len(server.peers)), (1, 1))
 
     def test_full_house(self) -> None:
-        """If all connections are in use, a new connection replaces the connection of a stranger, never of a member."""
+        """If all connections are in use, a new one replaces the connection of an unknown peer, never of a member."""
         server, served = self.made(is_plain=True)
         members = []
         for n in range(MAX_TOTAL_CONNECTIONS - 1):
@@ -413,7 +413,10 @@ class QueueLimitTests(TunnelCase):
 
 class JointTests(TunnelCase):
     def test_pick_by_address(self) -> None:
-        """A joint network sends to tunnel addresses by tunnel and to others by UDP, with one receiver for both."""
+        """A joint network sends to tunnel addresses by tunnel and to other addresses by UDP.
+
+        It has one receiver for both.
+        """
         switchboard = Switchboard(self.clock, random.Random(1))
         server, served = self.made()
         plain = switchboard.make_network("10.0.0.9", 7000)

@@ -311,7 +311,7 @@ class ClaimTests(SpaceCase):
     def test_get_behind_another_call_of_the_same_node(self) -> None:
         """A blocked get takes a tuple after another call of the same node has failed to take it."""
         fleet, (a, b, c) = self.spaces(3)
-        b.read(("bell", int)).addErrback(lambda failure: failure.trap(NotRunning))  # keeps the tuple cache of b open
+        b.read(("bell", int)).addErrback(lambda failure: failure.trap(NotRunning))  # keeps the cache of node b open
         self.done(fleet, a.put(("job", 1)), 1.0)
         self._claimed(fleet, c, lease=4.0)
         at_once, waiting = b.get_if_exists(("job", ANY)), b.get(("job", ANY))
