@@ -89,7 +89,7 @@ class LifeTests(FleetCase):
             self.assertLess(self.left(fleet, place) + fleet.clock.seconds() - began, TEAM_TTL_S + 1.0)
 
     def test_a_life_names_the_very_record(self) -> None:
-        """A TTL for a different record of the slot is ignored; a TTL beyond the maximum for the record is reduced."""
+        """A stated TTL is ignored if it is for another record of the slot, and is limited to the maximum TTL."""
         fleet = self.fleet(2)
         self.done(fleet, fleet.nodes[0].put(KEY, "a", b"x", "team", "all"), 1.0)
         handover: Any = fleet.nodes[1]._handover

@@ -246,7 +246,7 @@ class TunnelTests(TunnelCase):
         self.assertIn(b"Proxy-Authorization: Basic bWU6c2VjcmV0\r\n", relay.asked)
 
     def test_proxy_says_no(self) -> None:
-        """If the proxy rejects the request or sends an invalid reply, the tunnel sets a fault and does not open."""
+        """After a rejection or an invalid reply of the proxy, the proxy layer sets ``fault`` and does not open."""
         for answer in (
             b"HTTP/1.1 407 Proxy Authentication Required\r\n\r\n",
             b"SSH-2.0-box\r\n\r\n",
@@ -488,7 +488,7 @@ class TlsTests(SynchronousTestCase):
             self.assertEqual(came, b"in the clear" * 3000)
 
     def test_fault(self) -> None:
-        """Input that is not TLS, and a modified record, set a fault and raise no exception."""
+        """After input that is not TLS, or a modified record, the TLS layer sets ``fault`` and raises no exception."""
         self.server.decode(b"GET / HTTP/1.1\r\n\r\n")
         self.assertIn("TLS", self.server.fault)
         self.assertEqual(self.server.decode(b"more")[0], b"")

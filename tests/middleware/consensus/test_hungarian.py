@@ -35,7 +35,7 @@ class HungarianTests(SynchronousTestCase):
     def test_prices_prove_it(self) -> None:
         """The prices prove that the assignment is optimal.
 
-        Each row has its cheapest column, and unassigned columns have price 0.
+        With the prices added, each row is assigned its cheapest column; unassigned columns have price 0.
         """
         dice = random.Random(2)
         for _ in range(200):

@@ -53,7 +53,7 @@ def listed(places: Places, listing: Listing, silent: frozenset[bytes] = frozense
 
 class ListingTests(SynchronousTestCase):
     def test_everybody_once(self) -> None:
-        """All devices are listed once, with one read per prefix, whatever depth the reader assumes."""
+        """Every device is listed once, with one read per prefix, whatever depth the reader assumes at first."""
         depths = dict.fromkeys(owners(600), 5)
         for floor in (0, 3, 5):
             listing = listed(announced(depths), Listing(floor))

@@ -163,7 +163,7 @@ class TakeAcceptorTests(SynchronousTestCase):
         self.assertEqual(len(self.acceptor), 4)
 
     def test_unsettled(self) -> None:
-        """An accepted take without an outcome is listed after a while, until it is settled or its tuple is removed."""
+        """An accepted take without an outcome is listed after a while, until it is completed or its tuple removed."""
         for number in (1, 2, 3):
             self.store.put(tuple_record(place(number)), 999.0)
             self.claim(place(number))

@@ -92,7 +92,7 @@ class PathChoiceTests(SynchronousTestCase):
         self.assertEqual(path_choice.choose(MAX_DIRECT_BIDDERS), DIRECT)
 
     def test_team_size(self) -> None:
-        """In a small team all contacts are counted.
+        """The size of a small team is the number of contacts.
 
         The size of a large team is estimated from the density of the nearest nodes.
         """
@@ -106,7 +106,7 @@ class PathChoiceTests(SynchronousTestCase):
         self.assertTrue(1_500 < estimate_team_size(own, known, False) < 12_000)
         newcomer = near[:NEAREST_CONTACTS] + rng.sample(
             near[NEAREST_CONTACTS:], NEAREST_CONTACTS
-        )  # few contacts, but the team counts as large
+        )  # the contacts are few, but the node is told that the team is large
         self.assertTrue(1_500 < estimate_team_size(own, newcomer, True) < 12_000)
         self.assertEqual(estimate_team_size(own, newcomer[: NEAREST_CONTACTS - 1], True), NEAREST_CONTACTS)
 
@@ -277,7 +277,7 @@ class TreeNodeTests(SynchronousTestCase):
         self.assertEqual(asked, expected)
 
     def test_confirmed_is_not_sent_again(self) -> None:
-        """Only bids that the parent does not have are forwarded; a child's duplicate bid causes no message."""
+        """A node forwards only bids that its parent does not have; a child's duplicate bid causes no message."""
         self.participant.on_offer([bid(6, 1.0)], CONTACTS[6], 0.0, False, 0.0)
         [up] = offers(self.participant.take_due_messages(self.participant.due))
         self.participant.on_answer(up, 0.2)

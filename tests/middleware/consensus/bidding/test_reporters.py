@@ -62,7 +62,7 @@ class ReportersTests(SynchronousTestCase):
         self.assertAlmostEqual(self.reporters.compute_due(ME, 10.0), 10.0 + self.turn)
 
     def test_small_group_of_a_large_team(self) -> None:
-        """If few records exist after all turns, the group is small, and each agent writes immediately."""
+        """If only few records exist after all turns, the group counts as small, and each agent writes immediately."""
         over = LISTENING_S + MANY * TURN_SPACING_S + SETTLING_S
         self.assertEqual([self.reporters.is_partial(over - 0.01), self.reporters.is_partial(over)], [True, False])
         self.assertEqual(self.reporters.compute_due(ME, over), over)

@@ -111,7 +111,7 @@ class AcceptorTests(SynchronousTestCase):
         self.assertEqual(self.acceptor.prepare("t", 2, ballot(5, "b"), TTL, 0.3 + TTL).kind, ReplyKind.GRANTED)
 
     def test_release_that_overtakes_its_proposal(self) -> None:
-        """If a release arrives before its proposal, the proposal is not granted."""
+        """If the release of a ballot arrives before the proposal with this ballot, the proposal is not granted."""
         self.prepare(1, "a", 0.0)
         self.acceptor.release_by_ballot("t", ballot(1, "a"), 0.1)
         self.assertEqual(self.propose(1, "a", 1, 0.2).kind, ReplyKind.OUTBID)
@@ -132,7 +132,7 @@ class AcceptorTests(SynchronousTestCase):
             self.assertEqual(self.prepare(3, "b", 0.6)[:4:3], (ReplyKind.GRANTED, 0.0))
 
     def test_freed(self) -> None:
-        """A notice from another member that a lease was released is accepted only with the holder and its token."""
+        """Another member's notice of a release is accepted only if it names the holder and the token of the lease."""
         self.prepare(1, "a", 0.0)
         self.propose(1, "a", 1, 0.0)
         for agent, token in (("b", 1), ("a", 0), ("a", 2)):
