@@ -140,7 +140,7 @@ class PassTests(ClosedCase):
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2)), 2)
 
     def test_foreign_passes(self) -> None:
-        """Missing and oversized credentials are rejected as foreign.
+        """Missing and oversized credentials are rejected with the code "foreign".
 
         The admission check is not called for an oversized credential.
         """
@@ -365,7 +365,7 @@ class SecretTests(ClosedCase):
             self.assertEqual(self.got(requester.ask(self.to_b, "echo", 1), 4 * DELAY), 1)
 
     def test_nobody_is_remembered_by_an_old_one(self) -> None:
-        """A peer is contacted under the secret of its last handshake, until only the new secret is valid."""
+        """A node contacts a peer under the secret of their last handshake, until only the new secret is valid."""
         self.equip(self.a)
         self.b.replace_secrets(self.NEW, TEAM)
         self.assertEqual(self.got(self.b.discover(self.to_a.address), 1.0), self.to_a)
@@ -380,7 +380,7 @@ class RoleTests(ClosedCase):
     """Tests of methods that a role forbids."""
 
     def test_a_method_that_is_not_for_it(self) -> None:
-        """A call that the caller's role forbids is rejected in every form, does not run, and is logged once."""
+        """Requests and one-way messages that the caller's role forbids do not run, and are logged once."""
         self.b.expose("told", lambda peer: self.runs.append("told"))
         self.at_b.forbidden = {(self.to_a.public, name) for name in ("add", "whole", "told")}
         for asked in (

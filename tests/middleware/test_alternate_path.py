@@ -113,7 +113,7 @@ class AlternatePathsTests(SynchronousTestCase):
         self.assertEqual(self.successResultOf(answer), b"y" * 200_000)
 
     def test_others_are_told_no_tunnel(self) -> None:
-        """A tunnelled member is announced to other nodes as relayed; tunnel addresses from peers are not used."""
+        """A member that uses a tunnel is announced as relayed; a node uses no tunnel address that a peer sent."""
         other, _ = self.world.add(2)
         site, _ = self.world.add(1, is_blocked=True)
         self.world.run(4.0)

@@ -58,7 +58,7 @@ class InvariantTests(SynchronousTestCase):
         self.assertEqual({seed: found for seed in (7,) if (found := run(seed, ALL).found)}, {})
 
     def test_whole_agents(self) -> None:
-        """Fifteen schedules of whole agents differ, and violate none of the invariants E4 to E7.
+        """Fifteen schedules of whole agents differ, and violate no invariant of tasks and decisions (E4 to E7).
 
         The agents join, leave, fail, pause and cancel.
         """
@@ -74,7 +74,7 @@ class InvariantTests(SynchronousTestCase):
                 pass
 
     def test_bugs_are_found(self) -> None:
-        """A schedule with a seeded bug violates the invariant that detects it."""
+        """A schedule with a seeded bug violates the invariant that is listed for this bug."""
         blind = []
         for bug, (seed, invariant) in BITING.items():
             found = run(seed, FINDERS[bug], bug).found

@@ -116,7 +116,7 @@ class CrowdTests(FleetCase):
 
 
 def walk(thing: Any, path: str, sizes: dict[str, int], seen: set[int]) -> None:
-    """Record the size of every table that is reachable from a node."""
+    """Record the size of every table that can be reached through the attributes of a node."""
     if id(thing) in seen or isinstance(thing, str | bytes | int | float | random.Random | type):
         return
     seen.add(id(thing))

@@ -1,4 +1,4 @@
-"""Tests of one iterative lookup, and of the XOR metric."""
+"""Tests of the iterative lookup and of the XOR metric."""
 
 from __future__ import annotations
 

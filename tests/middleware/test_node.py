@@ -153,7 +153,7 @@ class LeaseTests(NodeCase):
         self.assertEqual([r.value for r in fleet.stores[0].get(KEY)], [b"here"])
 
     def test_replica_lets_go_of_what_it_holds_in_vain(self) -> None:
-        """A replica removes a leased record within a few renewals if the owner no longer has this record."""
+        """If the owner no longer has a leased record, its replicas remove the record within a few renewals."""
         fleet = self.fleet(3)
         old = Record(KEY, "old", fleet.nodes[2].identity.public, 1, "leased", 1.0, b"old").sign(fleet.identity(2))
         fleet.nodes[2].put(KEY, "state", b"here", "leased")
@@ -230,7 +230,7 @@ class WatchTests(NodeCase):
         self.assertEqual(len(self.flushLoggedErrors(IndexError)), 1)
 
     def test_push_by_a_stranger(self) -> None:
-        """Pushes from replicas without a subscription, and invalid pushes, are ignored."""
+        """A node ignores invalid pushes, and pushes from replicas at which it has no subscription."""
         fleet = self.fleet(3)
         told = self.watched(fleet.nodes[2])
         fleet.run(0.5)
@@ -413,7 +413,7 @@ class LargeFleetTests(NodeCase):
         self.assertEqual([r.value for r in heir.store.get(KEY)], [b"do it"])
 
     def test_former_replicas_do_not_count(self) -> None:
-        """When new nodes become holders of a key, watchers discard the reports of its former holders."""
+        """When new nodes become holders of a key, watchers of the key discard the reports of the former holders."""
         fleet = self.fleet(10, seed=8)
         self.done(fleet, fleet.nodes[0].put(KEY, "task", b"do it"))
         told = self.watched(fleet.nodes[0])

@@ -57,7 +57,7 @@ class OverlayTests(FleetCase):
                     self.assertLessEqual(others, {c.node_id for c in node.overlay.find_possible_replicas(key)})
 
     def test_one_sign_of_life_is_as_good_as_many(self) -> None:
-        """A repeated message from a contact changes nothing, unless the contact is suspected or has moved."""
+        """A repeated message from a contact changes nothing, unless the contact is suspected or has a new address."""
         fleet = self.fleet(3)
         overlay, other = fleet.nodes[0].overlay, fleet.nodes[1].contact
         seen: list[Contact] = []
@@ -90,7 +90,7 @@ class OverlayTests(FleetCase):
         self.assertLessEqual(others, {c.node_id for c in node.overlay.find_possible_replicas(key)})
 
     def test_the_silent_go(self) -> None:
-        """A node that fails is removed from every table after a while, a node that stops immediately."""
+        """A node that fails is removed from every table after a while; a node that stops is removed immediately."""
         fleet = self.fleet(4)
         fleet.nodes[3].stop_silently()
         fleet.nodes[2].stop()

@@ -157,14 +157,14 @@ class ReplicaTests(SynchronousTestCase):
         self.assertEqual(self.store.get(KEY), [])
 
     def test_goodbye(self) -> None:
-        """A goodbye ends the leases and watches of the peer but keeps its team records."""
+        """A goodbye ends the leases and watches of its sender; the team records of the sender stay."""
         self.stored(record(lifetime="leased"), record("t"))
         self.replica.answer_goodbye(self.dog)
         self.assertEqual([r.name for r in self.store.get(KEY)], ["t"])
         self.assertEqual(self.told[2:], [("gone", "state"), ("silent", DOG.public)])
 
     def test_missing(self) -> None:
-        """If the owner's digest differs, it gets the list of held leases after its second renewal.
+        """If the owner's digest differs, the owner gets the list of held leases after its second renewal.
 
         If all its leases have expired, it gets the list immediately.
         """

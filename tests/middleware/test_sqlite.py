@@ -201,7 +201,7 @@ class ReopenTest(SynchronousTestCase):
         self.assertEqual(self.store._connection.execute("PRAGMA synchronous").fetchone(), (2,))
 
     def test_one_node_a_file(self) -> None:
-        """A second node cannot open a file in use, and can open it after the first one closed it."""
+        """A second node cannot open a file in use; when the first node has closed the file, the second can open it."""
         error = self.assertRaises(BadStore, SqliteStore.open, self.path, 0.0)
         self.assertIn(f"another node uses it (process {os.getpid()})", str(error))
         self.after_restart()

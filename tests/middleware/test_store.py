@@ -172,7 +172,10 @@ class StoreContract(_Case):
             self.assertTrue(store.put(record("1", sequence=2, value=b""), FOREVER))
 
     def test_room_of_an_owner_comes_back(self) -> None:
-        """Tombstones count for their owner; only the owner's old tombstones are evicted for its new records."""
+        """Tombstones count for their owner.
+
+        If an owner's new records need space, only its own old tombstones are evicted.
+        """
         store = self.make(1000, hold=30.0)
         store.put(record("old", value=None, owner=CAT), 60.0)
         for number in range(499):
@@ -261,7 +264,7 @@ class MemoryStoreTest(StoreContract, SynchronousTestCase):
         return MemoryStore(max_rows, max_bytes, hold)
 
     def test_expiries_do_not_pile_up(self) -> None:
-        """The heap of expiry times stays proportional to the number of stored records."""
+        """The size of the heap of expiry times stays proportional to the number of stored records."""
         store = MemoryStore()
         for sequence in range(1, 1001):
             store.put(record(sequence=sequence), FOREVER - sequence)

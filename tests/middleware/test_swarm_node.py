@@ -220,7 +220,7 @@ class SwarmNodeTests(FleetCase):
         self.assertIsNone(node.find_contact(replace(record, value=b"?")))
 
     def test_too_much_to_say(self) -> None:
-        """A presence that exceeds the size of a record is logged as an error, and the node continues to run."""
+        """If the presence of a device does not fit into a record, an error is logged, and the node continues to run."""
         fleet = self.swarm(1)
         fleet.nodes[0].presence.change(capabilities={"arm": {"kind": "x" * 2000}})
         fleet.run(1.0)

@@ -98,7 +98,7 @@ class JoinCodecTests(SynchronousTestCase):
     def test_refusals_have_names(self) -> None:
         """A rejection arrives with its code, or with "unknown" for an unrecognized code.
 
-        A hint is decoded as a hint.
+        A hint (an unsigned rejection) is decoded as a hint.
         """
         for code, meant in (("used", "used"), ("silly", "unknown")):
             said = join_codec.make_refusal(INVITE.public, HEARD, code, signer(), random.Random(2))

@@ -59,7 +59,7 @@ class JoiningTests(VillageCase):
         self.assertEqual(self.successResultOf(knocked).member.name, "dog")
 
     def test_member_that_is_no_bootstrap(self) -> None:
-        """A plain member rejects a newcomer with "role".
+        """A member that is not a bootstrap node rejects a newcomer with the code "role".
 
         After the promotion to bootstrap node, this member admits the newcomer without a restart.
         """

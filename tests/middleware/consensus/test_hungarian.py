@@ -35,7 +35,7 @@ class HungarianTests(SynchronousTestCase):
     def test_prices_prove_it(self) -> None:
         """The prices prove that the assignment is optimal.
 
-        With the prices added, each row is assigned its cheapest column; unassigned columns have price 0.
+        Each row is assigned the column with the lowest cost minus price; unassigned columns have price 0.
         """
         dice = random.Random(2)
         for _ in range(200):

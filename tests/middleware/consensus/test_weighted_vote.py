@@ -55,7 +55,7 @@ class WeightedVoteTests(SynchronousTestCase):
         self.assertEqual(len(digests), 2)
 
     def test_all_have_voted(self) -> None:
-        """When all have voted, the option with the most weight wins even without a majority; a hash breaks ties."""
+        """When all agents have voted, the option with the most weight wins without a majority; a hash breaks ties."""
         votes = [
             vote(name, choice) for name, choice in zip("abcde", ["red", "red", "blue", "blue", "green"], strict=True)
         ]

@@ -53,7 +53,7 @@ class QuietTests(SitesCase):
 
 
 class HostileTests(SitesCase):
-    """Attacks by members that lie or send too many requests."""
+    """Attacks by members that send false addresses or too many requests."""
 
     def setUp(self) -> None:
         """Create a public node and two nodes that know it."""

@@ -66,7 +66,7 @@ class LogTests(SynchronousTestCase):
         self.assertEqual(self.opened().floor.longest, 9.0)
 
     def test_rotten_notes(self) -> None:
-        """If a stored vote is unreadable, the log uses the other votes and is not whole."""
+        """If a stored vote is unreadable, the log uses the other votes, and reports that it is not whole."""
         granted(self.log, "t", 7, 0.0)
         for corrupt in (b"\xc1", msgpack.packb([1]), msgpack.packb({"t": [1]}), msgpack.packb({"t": 5})):
             for name in filter(self.store.get_note, CODEC.names):

@@ -92,7 +92,7 @@ class PathChoiceTests(SynchronousTestCase):
         self.assertEqual(path_choice.choose(MAX_DIRECT_BIDDERS), DIRECT)
 
     def test_team_size(self) -> None:
-        """The size of a small team is the number of contacts.
+        """The size of a small team is counted: a node and its contacts.
 
         The size of a large team is estimated from the density of the nearest nodes.
         """
@@ -254,7 +254,7 @@ class TreeNodeTests(SynchronousTestCase):
         self.assertEqual(up.to, find_hops(AUCTION, CONTACTS[5].node_id, CONTACTS)[0])
 
     def test_nearer_ones_wait_longer(self) -> None:
-        """Nodes nearer to the key wait longer for bids of their children, up to half the waiting period."""
+        """A node that is nearer to the key waits longer for bids of its children, up to half the waiting period."""
         waits = []
         for contact in sorted(CONTACTS[3:], key=lambda c: count_shared_bits(c.node_id, AUCTION.key)):
             one = make_participant(CONTACTS.index(contact))
