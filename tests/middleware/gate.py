@@ -1,4 +1,4 @@
-"""An admission check for tests that records each peer that it checks."""
+"""An admission check for tests, which records the peers that it has checked."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ ROOM = 640
 class Gate(OpenAdmission):
     """Admit a peer if its credential begins with ``pass`` and its key is not in ``refused``.
 
-    ``forbidden`` contains pairs of a public key and a method that it may not call. ``unwritable`` contains pairs of a
-    public key and the name of a slot that it may not write.
+    ``forbidden`` contains pairs of a public key and a method, which the owner of the key may not call. ``unwritable``
+    contains pairs of a public key and the name of a slot, which the owner of the key may not write.
     """
 
     fingerprint = b"the team"

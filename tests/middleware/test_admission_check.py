@@ -86,7 +86,7 @@ class ClosedCase(EndpointCase, LogCase):
         return endpoint, Contact(own.public, tap.address)
 
     def refused(self, asked: Deferred[Any], code: str, seconds: float = 3.0) -> str:
-        """Return the error message of a request that is rejected with ``code``."""
+        """Return the error message of a request, after a check that the request was rejected with ``code``."""
         self.clock.advance(seconds)
         error = self.failureResultOf(asked, NotAdmitted).value
         self.assertEqual(error.code, code)
@@ -140,7 +140,7 @@ class PassTests(ClosedCase):
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2)), 2)
 
     def test_foreign_passes(self) -> None:
-        """Missing and oversized credentials are rejected as foreign.
+        """Missing and oversized credentials are rejected with the code "foreign".
 
         The admission check is not called for an oversized credential.
         """
@@ -298,9 +298,9 @@ class IncarnationTests(ClosedCase):
         self.assertEqual(self.got(later.ask(self.to_b, "echo", 4)), 4)
 
     def test_lives(self) -> None:
-        """The latest incarnation is valid, the previous one superseded, and others doubled.
+        """The latest incarnation is valid, the previous one superseded, and any other doubled.
 
-        Number 0 is always valid.
+        An incarnation with number 0 is always valid.
         """
         incarnations, one, two = Incarnations(), Incarnation(1, b"1" * 8), Incarnation(2, b"2" * 8)
         self.assertFalse(incarnations.record(b"a", one))
@@ -357,7 +357,7 @@ class SecretTests(ClosedCase):
         self.assertEqual(self.got(new.ask(self.to_b, "echo", 4), 4 * DELAY), 4)
 
     def test_cookies_under_each_secret(self) -> None:
-        """Under load a member can decrypt its cookie if it has only the old or only the new secret."""
+        """Under load a member can decrypt its cookie, whether it has only the old secret or only the new one."""
         self.b.replace_secrets(self.NEW, TEAM)
         new, _ = self.endpoint(8, team=self.NEW)
         for requester in (self.a, new):
@@ -365,7 +365,7 @@ class SecretTests(ClosedCase):
             self.assertEqual(self.got(requester.ask(self.to_b, "echo", 1), 4 * DELAY), 1)
 
     def test_nobody_is_remembered_by_an_old_one(self) -> None:
-        """A peer is contacted under the secret of its last handshake, until only the new secret is valid."""
+        """A node contacts a peer under the secret of their last handshake, until only the new secret is valid."""
         self.equip(self.a)
         self.b.replace_secrets(self.NEW, TEAM)
         self.assertEqual(self.got(self.b.discover(self.to_a.address), 1.0), self.to_a)
@@ -380,7 +380,7 @@ class RoleTests(ClosedCase):
     """Tests of methods that a role forbids."""
 
     def test_a_method_that_is_not_for_it(self) -> None:
-        """A call that the caller's role forbids is rejected in every form, does not run, and is logged once."""
+        """Requests and one-way messages that the caller's role forbids do not run, and are logged once."""
         self.b.expose("told", lambda peer: self.runs.append("told"))
         self.at_b.forbidden = {(self.to_a.public, name) for name in ("add", "whole", "told")}
         for asked in (
@@ -398,7 +398,7 @@ class RoleTests(ClosedCase):
 
 
 class RouteTests(EndpointCase):
-    """Tests of datagrams of other kinds."""
+    """Tests of datagrams of kinds that the endpoint itself does not handle."""
 
     def test_a_kind_has_one_receiver(self) -> None:
         """Datagrams of a routed kind go to their receiver; a kind that is already in use cannot be routed."""
@@ -472,7 +472,7 @@ class MemberTests(FleetCase, LogCase):
         return fleet
 
     def test_the_last_one_left_does_not_look_for_it(self) -> None:
-        """A node that evicted the only other member does not try to reach this member."""
+        """If a node has evicted the only other member, it does not try to reach this member."""
         fleet = self.gated(2)
         fleet.evict(1, by=(0,))
         fleet.kill(1)
@@ -482,7 +482,7 @@ class MemberTests(FleetCase, LogCase):
         self.assertEqual(fleet.switchboard.counters["sent"], sent)
 
     def test_a_copy_of_a_member(self) -> None:
-        """If a copy of a member is rejected, or replaces the first node, other nodes do not remove the member."""
+        """Other nodes do not remove a member if a copy of it is rejected, or if a copy replaces the first node."""
         for number, is_in in ((0, False), (99, True)):
             fleet = self.gated(3)
             public, life = fleet.identity(2).public, fleet.gates[2].incarnation
@@ -519,7 +519,7 @@ class MemberTests(FleetCase, LogCase):
         self.failureResultOf(stored, NoAnswer)
 
     def test_a_recording_parts_nobody(self) -> None:
-        """A recorded INIT with an expired credential is rejected; its sender keeps its membership and leases."""
+        """A replayed INIT with an expired credential is rejected; the member that it names keeps its leases."""
         fleet = self.gated(3)
         init = [d for d, to in self.recorded(fleet, 2) if d[0] == INIT][0]
         self.done(fleet, fleet.nodes[2].put(KEY, "here", b"2", "leased"))
@@ -561,7 +561,7 @@ class RejectionTests(SynchronousTestCase):
         self.rejections = Rejections()
 
     def met(self, who: bytes, now: float, code: str = "revoked") -> None:
-        """Record a rejection."""
+        """Record a rejection in the list of rejections."""
         self.rejections.record(who, "10.0.0.1:7000", "we", code, "why; what to do", now)
 
     def test_count_what_happens_again(self) -> None:

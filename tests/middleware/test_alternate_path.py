@@ -85,7 +85,7 @@ class AlternatePathsTests(SynchronousTestCase):
         self.assertEqual(self.world.clock.getDelayedCalls(), [])
 
     def call(self, requester: Site, asked: Site) -> object:
-        """Return the answer of ``asked`` to a call from ``requester``, at an address that ``requester`` knows."""
+        """Let ``requester`` call ``asked`` at an address that ``requester`` knows; return the answer."""
         (contact,) = (c for c in requester.node.overlay.contacts() if c.public == asked.node.identity.public)
         answer = requester.node.call(contact, "who")
         self.world.run(2.0)
@@ -113,7 +113,7 @@ class AlternatePathsTests(SynchronousTestCase):
         self.assertEqual(self.successResultOf(answer), b"y" * 200_000)
 
     def test_others_are_told_no_tunnel(self) -> None:
-        """A tunnelled member is announced to other nodes as relayed; tunnel addresses from peers are not used."""
+        """A member that uses a tunnel is announced as relayed; a node uses no tunnel address that a peer sent."""
         other, _ = self.world.add(2)
         site, _ = self.world.add(1, is_blocked=True)
         self.world.run(4.0)
@@ -129,7 +129,7 @@ class AlternatePathsTests(SynchronousTestCase):
             self.assertEqual(Contact(public, Address(host, 1)).pack(), [public, *relayed_address(told.node_id)])
 
     def test_everybody_reaches_everybody(self) -> None:
-        """Two blocked members and two others all reach each other 4 s after the last of them started to join."""
+        """Two members with blocked UDP and two without reach each other 4 s after the last of them started to join."""
         sites = [self.bootstrap]
         for place, is_blocked in ((1, True), (2, False), (3, True), (4, False)):
             sites.append(self.world.add(place, is_blocked)[0])
@@ -170,7 +170,7 @@ class AlternatePathsTests(SynchronousTestCase):
         self.assertEqual(self.call(self.bootstrap, site), 1)
 
     def test_bootstrap_restarts(self) -> None:
-        """A restarted bootstrap node does not wait for tunnelled members; these and new nodes join within 15 s."""
+        """A restarted bootstrap node does not wait for tunnelled members; they and new nodes join within 15 s."""
         site, _ = self.world.add(1, is_blocked=True)
         self.world.run(40.0)
         self.bootstrap.node.stop_silently()

@@ -86,7 +86,10 @@ class FirstTests(SynchronousTestCase):
         self.assertEqual(results, [2, 0])
 
     def test_too_few(self) -> None:
-        """If too many calls fail, ``first`` returns the results of the others; without calls it returns immediately."""
+        """If too many calls fail, ``first`` returns the results of the successful calls.
+
+        Without calls it returns immediately.
+        """
         result = self.begin(3)
         self.asked[0].errback(NoAnswer("x"))
         self.asked[1].callback(1)

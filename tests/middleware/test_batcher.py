@@ -46,7 +46,10 @@ class RecordBatcherTests(FleetCase):
         self.world.nodes[1].endpoint.expose("store", counted, changes=True, idempotent=True)
 
     def test_a_flood_shares_questions(self) -> None:
-        """The first of forty records is sent alone and immediately; the others share requests of one datagram each."""
+        """The first of forty records is sent alone and immediately.
+
+        The others are batched in requests of one datagram.
+        """
         self.count_questions()
         replies = self.stored(*[self.record(number) for number in range(FLOOD)])
         self.world.run(0.1)

@@ -30,7 +30,7 @@ class PathCacheTests(SynchronousTestCase):
             self.assertIsNone(self.cache.get(self.key, lives))
 
     def test_what_is_not_kept(self) -> None:
-        """A copy without a positive finite TTL or over the size limit is not stored, and removes the previous copy."""
+        """A copy that is too large, or has no positive finite TTL, is not stored; the previous copy is removed."""
         for ttl, size in ((0.0, 1), (-1.0, 1), (float("nan"), 1), (9.0, MAX_BYTES)):
             self.cache.put(self.key, copied(self.key), 9.0, 0.0)
             self.cache.put(self.key, copied(self.key, size), ttl, 0.0)
@@ -65,7 +65,7 @@ class PathCacheTests(SynchronousTestCase):
         self.assertIsNotNone(self.cache.get(self.key, 9.0))
 
     def held(self, keys: list[bytes]) -> list[int]:
-        """Return the numbers of those ``keys`` that are cached, and read each of them in order."""
+        """Read each of these keys in order; return the numbers of the keys that are cached."""
         return [number for number, key in enumerate(keys) if self.cache.get(key, 0.0) is not None]
 
 
@@ -91,7 +91,7 @@ class WatchedCopiesTests(SynchronousTestCase):
         self.copies = WatchedCopies(self.store)
 
     def test_what_is_held_is_left_alone(self) -> None:
-        """If the node stores a slot as a replica, this slot is neither copied nor released."""
+        """If the node stores a slot as a replica, the cache neither copies nor releases this slot."""
         self.store.put(record("a"), 5.0)
         self.copies.replace(KEY, [record("a", 2)], 0.0)
         self.copies.replace(KEY, [], 0.0)

@@ -98,7 +98,7 @@ class HeapClockTests(SynchronousTestCase):
 
 class MonotonicTests(SynchronousTestCase):
     def test_reactors_run_on_boot_time(self) -> None:
-        """``use_monotonic_time`` makes every reactor use the boot-time clock, and can be called twice."""
+        """After ``use_monotonic_time`` every reactor uses the boot-time clock; a second call has no effect."""
         self.patch(ReactorBase, "seconds", ReactorBase.__dict__["seconds"])
         use_monotonic_time()
         use_monotonic_time()

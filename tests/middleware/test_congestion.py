@@ -51,7 +51,7 @@ class LongWayTests(EndpointCase):
         self.switchboard.conditions = LinkConditions(FAR)
 
     def test_one_handshake_is_enough(self) -> None:
-        """Concurrent requests in both directions wait for one handshake; no second handshake is started."""
+        """Concurrent requests in both directions wait for the same handshake, and start no second one."""
         self.got(self.a.ask(self.to_b, "add", 1))
         self.got(self.b.ask(self.to_a, "add", 2))
         self.got(self.a.ask(self.to_b, "add", 3))
@@ -83,7 +83,7 @@ class LossTests(SynchronousTestCase):
     """Tests of ``LossRate``."""
 
     def test_the_share_is_what_gets_lost(self) -> None:
-        """After 500 datagrams the mean estimate of 100 receivers is within 0.02 of the loss rate."""
+        """After 500 datagrams the estimates of 100 receivers have a mean within 0.02 of the loss rate."""
         for share in (0.0, 0.1, 0.3):
             shares = [heard(share, 500, random.Random(seed)).rate for seed in range(100)]
             self.assertLess(abs(sum(shares) / 100 - share), 0.02)
@@ -139,7 +139,7 @@ class RoughWeatherTests(EndpointCase):
         self.switchboard.conditions = LinkConditions(DELAY, loss=0.3)
         self.answered(100, 1.0)
         self.assertGreater(self.a.peers.tries, MAX_TRIES)
-        self.assertGreaterEqual(self.answered(500, 1.0), 498)  # about 466 with four tries
+        self.assertGreaterEqual(self.answered(500, 1.0), 498)  # with four tries about 466 requests would be answered
 
     def test_the_first_contact_as_well(self) -> None:
         """Handshakes are also retransmitted according to the loss rate."""
@@ -151,7 +151,8 @@ class RoughWeatherTests(EndpointCase):
         asked = [self.a.ask(to, "echo", 1) for _, to in strangers]
         self.clock.advance(3.0)
         answers = [one.addErrback(lambda failure: None) for one in asked]
-        self.assertGreaterEqual(sum(self.successResultOf(one) == 1 for one in answers), 97)  # 94 with four tries
+        # With only four tries 94 handshakes would succeed.
+        self.assertGreaterEqual(sum(self.successResultOf(one) == 1 for one in answers), 97)
 
     def test_few_tries_are_in_vain(self) -> None:
         """With variable round-trip times at most one reply in eight arrives after an unnecessary retransmission."""

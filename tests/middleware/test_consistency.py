@@ -64,9 +64,9 @@ class WriteConsistencyTests(ConsistencyCase):
             self.assertGreaterEqual(stored, least)
 
     def test_named_error_says_how_many(self) -> None:
-        """If two of five nodes are cut off, ``all`` fails with three acknowledgements.
+        """If two of five nodes are cut off, a write at level ``all`` fails with three acknowledgements.
 
-        The two nodes fail with ``majority``.
+        At the two nodes a write at level ``majority`` fails.
         """
         fleet = self.fleet(5)
         self.cut(fleet, 3, 4)
@@ -228,7 +228,7 @@ class AbsenceTests(ConsistencyCase):
                 moment[0] += away
 
     def life(self, fleet: EntangledTeam, moment: list[float]) -> EntangledNode:
-        """Run the node with index 0 once, with a wall clock."""
+        """Start the node with index 0 with a wall clock, and run it for a while."""
         network = fleet.switchboard.make_network(*fleet.address(0))
         node = EntangledNode(
             fleet.identity(0),
@@ -248,7 +248,7 @@ class AbsenceTests(ConsistencyCase):
 
 class WatchNumberTests(ConsistencyCase):
     def test_a_gap_is_noticed_and_filled(self) -> None:
-        """A watcher detects a lost push by the number of the next push, and requests the records immediately."""
+        """A watcher detects a lost push by a gap in the numbers of pushes, and requests the records immediately."""
         fleet = self.fleet(2)
         told: list[list[bytes | None]] = []
         watch = fleet.nodes[1].watch(KEY, lambda records: told.append([r.value for r in records]))
@@ -310,7 +310,7 @@ class WalkTests(ConsistencyCase):
 
 
 class Replaced(MemoryStore):
-    """A store that replaced a corrupted file and kept the notes of this file."""
+    """A store that has replaced a corrupted file but still has the notes of this file."""
 
     origin = "replaced"
 
@@ -416,7 +416,7 @@ class CutTests(ConsistencyCase):
         self.assertEqual((refused.acknowledged, refused.needed), (1, 2))
 
     def test_a_later_record_at_the_unsure(self) -> None:
-        """A later record at a replica without a vote does not acknowledge an earlier write."""
+        """If a replica without a vote has a later record, this does not count as an acknowledgement of a write."""
         fleet = self.fleet(2)
         fleet.nodes[1].replica.is_synced = lambda: False
         first = fleet.nodes[0].put(KEY, "a", b"x")
@@ -426,7 +426,7 @@ class CutTests(ConsistencyCase):
         self.assertIsInstance(self.outcome(fleet, second), NotAcknowledged)
 
     def test_a_later_record_at_the_sure(self) -> None:
-        """A write is acknowledged if a majority stores the next version of its record."""
+        """A write is acknowledged if a majority already stores a later version of the record."""
         fleet = self.fleet(3)
         fleet.switchboard.conditions = LinkConditions(delay_s=0.02, jitter_s=0.02, reorder=0.5)
         for _ in range(10):
@@ -466,7 +466,7 @@ class StartTests(ConsistencyCase):
         self.assertEqual([node.replica.is_synced() for node in fleet.nodes], [True] * 5)
 
     def test_a_power_cut(self) -> None:
-        """If all members except one restart from disk, the team is synced and can write within seconds."""
+        """If all members but one restart from disk, the team is synced and can write within seconds."""
         fleet = self.fleet(5)
         self.outcome(fleet, fleet.nodes[0].put(KEY, "a", b"x"))
         for node in fleet.nodes:

@@ -120,7 +120,7 @@ class ProbeTests(EndpointCase):
         self.failureResultOf(self.a.probe(HOME), NotRunning)
 
     def test_what_is_none(self) -> None:
-        """Probes and replies of wrong length, and replies without a probe, are counted and not answered."""
+        """Probes of wrong length, replies of wrong length and unsolicited replies are counted and not answered."""
         receiver = self.taps[self.to_b.address].receiver
         before = self.switchboard.counters["sent"]
         for datagram in (

@@ -52,7 +52,7 @@ class CallTests(EndpointCase):
             raise
 
     def when(self, peer: Contact, *, deadline: float) -> float:
-        """Return the time in seconds for which the caller still waits."""
+        """Return for how many more seconds the caller waits for the reply."""
         return deadline - self.clock.seconds()
 
     def occupied(self, peer: Contact) -> None:
@@ -96,7 +96,7 @@ class CallTests(EndpointCase):
         self.assertEqual(self.got(asked), "done")
 
     def test_deadline_is_carried(self) -> None:
-        """A method gets the remaining time of its caller, less the network delay, in milliseconds as 32 bits."""
+        """A method gets the caller's remaining time, less the network delay, as milliseconds in 32 bits."""
         for seconds, milliseconds in ((1.5, 1500), (-1.0, 0), (1e9, NO_LIMIT_MS)):
             aged_one = decode(set_remaining_time(encode(Request(1, "m", (), 7)), seconds))
             self.assertEqual(aged_one, Request(1, "m", (), milliseconds))

@@ -102,17 +102,17 @@ class EndpointCase(SynchronousTestCase):
         return endpoint, Contact(own.public, tap.address)
 
     def got(self, deferred: Deferred[Any], seconds: float = 3.0) -> Any:
-        """Return the result of a Deferred after some time."""
+        """Let some time pass; return the result of a Deferred."""
         self.clock.advance(seconds)
         return self.successResultOf(deferred)
 
     def failed(self, deferred: Deferred[Any], kind: type[Exception], seconds: float = 3.0) -> str:
-        """Return the error message of a Deferred after some time."""
+        """Let some time pass; return the error message of a Deferred."""
         self.clock.advance(seconds)
         return str(self.failureResultOf(deferred, kind).value)
 
     def kept(self, contact: Contact, kind: int) -> list[tuple[bytes, Address]]:
-        """Return the datagrams of one kind that a node received."""
+        """Return the received datagrams of one kind."""
         return [item for item in self.taps[contact.address].kept if item[0][0] == kind]
 
 
@@ -185,7 +185,7 @@ class AskTests(EndpointCase):
             self.assertEqual(self.got(asked, 0.1), 42)
 
     def test_no_answer(self) -> None:
-        """Without a reply a request fails in 1.5 s after four tries, and earlier for a peer that is near."""
+        """Without a reply a request fails after four tries, which take 1.5 s, or less for a peer that is near."""
         asked = self.a.ask(Contact(self.to_b.public, Address("127.0.0.1", 9)), "echo", 1)
         self.clock.advance(1.4)
         self.assertNoResult(asked)
@@ -211,7 +211,7 @@ class AskTests(EndpointCase):
         self.assertEqual(self.a.counters["unasked"], 1)
 
     def test_both_open_at_once(self) -> None:
-        """If both endpoints start a handshake at the same time, both get replies to this and to later requests."""
+        """If two endpoints start handshakes with each other at the same time, both get replies to all requests."""
         self.equip(self.a)
         both = [self.a.ask(self.to_b, "add", 1, changes=True), self.b.ask(self.to_a, "add", 2, changes=True)]
         self.clock.advance(1)

@@ -183,7 +183,7 @@ class HostileTests(FragmenterCase):
         self.got(self.a.ask(self.to_b, "echo", 1))
 
     def test_late_parts_begin_nothing(self) -> None:
-        """A fragment of a completed request, or of a reply to no request, starts no message."""
+        """A fragment of a completed request, or of an unsolicited reply, does not start a message."""
         self.got(self.a.ask(self.to_b, "echo", LARGE[:5000]))
         key = next(iter(self.b._fragmenter._completed))[1]
         got = self.fire(self.part(1, 5030, key.id))
@@ -193,7 +193,7 @@ class HostileTests(FragmenterCase):
         self.assertEqual((counted, self.b._fragmenter._incoming), ([1, 1], {}))
 
     def test_a_parcel_must_be_what_it_says(self) -> None:
-        """If a request contains a different id from its fragments, it is dropped and not executed."""
+        """A request is dropped and not executed if its id differs from the id in its fragments."""
         message = encode(Request(5, "add", (b"x" * 2000,)))
         for number in range(2):
             data = message[number * FRAGMENT_BYTES : (number + 1) * FRAGMENT_BYTES]
@@ -201,7 +201,7 @@ class HostileTests(FragmenterCase):
         self.assertEqual((self.b.counters["malformed"], self.runs), (1, []))
 
     def test_receipts(self) -> None:
-        """An acknowledgement lists the received fragments in any order, in minimal encoding."""
+        """An acknowledgement lists the received fragments in minimal encoding, whatever their order of arrival."""
         assembly = IncomingMessage.empty(10 * FRAGMENT_BYTES, 0.0)
         for number, is_urgent in ((0, False), (1, False), (4, True), (5, False), (4, True), (2, False)):
             part = Fragment(MessageKey(False, 1), False, 10 * FRAGMENT_BYTES, number, bytes(FRAGMENT_BYTES))

@@ -43,7 +43,7 @@ class LifeTests(FleetCase):
         return 0.0 if expiry is None else expiry - fleet.clock.seconds()
 
     def newcomer_that_meets_a_liar(self, told: float) -> EntangledTeam:
-        """Return five nodes, of which node 1 states a remaining TTL of ``told`` for all records.
+        """Return five nodes; node 1 falsely states a remaining TTL of ``told`` for all records.
 
         The last node joined through node 1 only.
         """
@@ -67,7 +67,7 @@ class LifeTests(FleetCase):
         self.assertGreater(self.left(fleet, 4), TEAM_TTL_S - 60.0)
 
     def test_nor_behind_records_of_its_own(self) -> None:
-        """If the malicious node has records with long TTLs, they do not hide the TTLs that it shortened."""
+        """The TTLs that a malicious node shortened are corrected, even if it also has records with long TTLs."""
         fleet = self.newcomer_that_meets_a_liar(2 * HOUR)
         liar = fleet.identity(1)
         for number in range(60):
@@ -89,7 +89,7 @@ class LifeTests(FleetCase):
             self.assertLess(self.left(fleet, place) + fleet.clock.seconds() - began, TEAM_TTL_S + 1.0)
 
     def test_a_life_names_the_very_record(self) -> None:
-        """A TTL for a different record of the slot is ignored; a TTL beyond the maximum for the record is reduced."""
+        """A stated TTL is ignored if it is for another record of the slot, and is limited to the maximum TTL."""
         fleet = self.fleet(2)
         self.done(fleet, fleet.nodes[0].put(KEY, "a", b"x", "team", "all"), 1.0)
         handover: Any = fleet.nodes[1]._handover
@@ -141,7 +141,7 @@ class ManyTests(FleetCase):
     """Tests of thousands of records of one owner, and of reads of many records."""
 
     def test_a_holder_reads_no_record_again(self) -> None:
-        """In a majority read by a replica only digests are transferred if the replicas agree, otherwise records."""
+        """When a replica reads by majority, only digests are transferred if the replicas agree, otherwise records."""
         fleet = self.fleet(5)
         for number in range(300):
             fleet.nodes[0].put(KEY, str(number), b"x" * 100, "team", "all")
@@ -300,7 +300,7 @@ class JoinTests(FleetCase):
     """Tests of joining: the cost until the first read, and the hand-over after it."""
 
     def test_a_newcomer_reads_at_once(self) -> None:
-        """In a team of 20 the first read of a new node takes few datagrams, for any bootstrap node."""
+        """In a team of 20 the first read of a new node takes few datagrams, whatever its bootstrap node is."""
         fleet = self.fleet(20)
         keys = [hash_key(str(number)) for number in range(6)]
         for key in keys:

@@ -31,7 +31,7 @@ class IdentityTest(SynchronousTestCase):
         self.assertNotEqual(DOG.node_id, CAT.node_id)
 
     def test_signatures(self) -> None:
-        """A signature is valid only for one message of one node; other input of any length is rejected."""
+        """A signature is valid only for its message and its signer; any other input is rejected."""
         signature = DOG.sign(b"sit")
         self.assertTrue(is_signature_valid(DOG.public, b"sit", signature))
         self.assertFalse(is_signature_valid(DOG.public, b"run", signature))

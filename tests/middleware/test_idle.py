@@ -19,7 +19,7 @@ def record(name: str, ttl: float) -> Record:
 
 class IdleTests(FleetCase):
     def looks(self, fleet: EntangledTeam) -> list[float]:
-        """Return a list that will contain the times of later expiry sweeps of the first node."""
+        """Return a list that will contain the time of each later expiry sweep of the first node."""
         moments: list[float] = []
         store = fleet.nodes[0].store
         expire = store.expire

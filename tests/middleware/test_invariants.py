@@ -34,7 +34,7 @@ DIGEST = "from tests.middleware.test_invariants import digests; print(digests())
 
 
 def digests() -> list[str]:
-    """Return the digests of all datagrams and events, for one run of every workload, of tasks and of leases."""
+    """Return the digests of datagrams and events of three runs: all workloads, tasks, and leases."""
     schedule, tasks, leases = Schedule(1, SqliteTeam), Tasks(3), Leases(3)
     schedule.run([workload(schedule) for workload in WORKLOADS.values()])
     tasks.run()
@@ -58,7 +58,7 @@ class InvariantTests(SynchronousTestCase):
         self.assertEqual({seed: found for seed in (7,) if (found := run(seed, ALL).found)}, {})
 
     def test_whole_agents(self) -> None:
-        """Fifteen schedules of whole agents violate none of the invariants E4 to E7, and differ.
+        """Fifteen schedules of whole agents differ, and violate no invariant of tasks and decisions (E4 to E7).
 
         The agents join, leave, fail, pause and cancel.
         """
@@ -68,13 +68,13 @@ class InvariantTests(SynchronousTestCase):
         self.assertEqual(outcomes[0], run(7001, ("tasks",)))
 
     def test_bugs_have_their_places(self) -> None:
-        """Every seeded bug replaces an attribute that exists in the code."""
+        """Each seeded bug replaces an attribute of the code, and this attribute exists."""
         for bug in FINDERS:
             with self.subTest(bug=bug), seeded(bug):
                 pass
 
     def test_bugs_are_found(self) -> None:
-        """A schedule with a seeded bug violates the invariant that detects it."""
+        """A schedule with a seeded bug violates the invariant that is listed for this bug."""
         blind = []
         for bug, (seed, invariant) in BITING.items():
             found = run(seed, FINDERS[bug], bug).found

@@ -36,7 +36,7 @@ class Lan(EntangledTeam):
         return node
 
     def traffic(self) -> dict[str, int]:
-        """Return the sum of the counters of all nodes."""
+        """Return the counters, each summed over all nodes."""
         counted = [node.discovery.counters for node in self.nodes if node.discovery is not None]
         return {name: sum(each[name] for each in counted) for name in ("calls", "answered", "left", "greeted")}
 
@@ -51,7 +51,10 @@ class DiscoveryTests(FleetCase):
         return lan
 
     def test_two_find_each_other(self) -> None:
-        """Two nodes without known nodes join within 0.5 s; a node that lost all its peers soon searches again."""
+        """Two nodes without known nodes join within 0.5 s.
+
+        If a node later loses all its peers, it soon searches for others.
+        """
         lan = self.lan()
         a, b = lan.on(0), lan.on(1)
         lan.run(0.5)

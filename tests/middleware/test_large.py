@@ -74,7 +74,7 @@ class LargeTests(FleetCase):
         return self.done(fleet, node.find_node(target), 2.0)
 
     def test_a_lookup_finds_who_let_go_of_the_session(self) -> None:
-        """Lookups over slow paths are exact even if some nodes have closed sessions that their peers still use."""
+        """Lookups over slow paths find the closest nodes, even if nodes closed sessions that their peers still use."""
         fleet = self.large(weather=LinkConditions(0.08))
         node, target = fleet.nodes[0], self.far(fleet.nodes[0]).node_id
         others = [other.contact for other in fleet.nodes[1:]]
@@ -86,9 +86,9 @@ class LargeTests(FleetCase):
         self.assertEqual(self.found(fleet, node, target), select_closest(others, target, K))
 
     def far_from(self, fleet: EntangledTeam, key: bytes) -> tuple[EntangledNode, EntangledNode]:
-        """Return the node farthest from a key and the first contact that it queries.
+        """Return the node farthest from a key, and the contact that this node queries first.
 
-        The contacts of the farthest node contain no holder of the key.
+        The k nodes closest to the key are removed from the contacts of the farthest node.
         """
         order = select_closest([node.contact for node in fleet.nodes], key, len(fleet.nodes))
         reader, first = (fleet.nodes[contact.address.port - 7000] for contact in (order[-1], order[K]))
@@ -99,9 +99,9 @@ class LargeTests(FleetCase):
         return reader, first
 
     def test_a_fast_read_goes_past_who_wrote(self) -> None:
-        """A fast read of a key with many writers is complete.
+        """A fast read of a key with many writers returns all their records.
 
-        It does not end at the first queried node, which stores only one old record.
+        The read does not end at the first queried node, which stores only one old record.
         """
         fleet = self.large()
         key = hash_key("all write here")
@@ -122,7 +122,7 @@ class LargeTests(FleetCase):
         self.assertEqual(self.done(fleet, reader.get(key, "fast")), [record])
 
     def test_many_lookups_that_meet_the_same_strangers(self) -> None:
-        """Concurrent lookups that share one handshake per node are exact."""
+        """Concurrent lookups share one handshake per node, and each finds exactly the closest nodes."""
         fleet = self.large()
         node, dice = fleet.nodes[0], random.Random(4)
         others = [other.contact for other in fleet.nodes[1:]]
@@ -152,7 +152,7 @@ class LargeTests(FleetCase):
         far = [contact.node_id for contact in node.overlay.contacts() if contact.node_id not in near]
         self.assertTrue(far and all(asked[node_id] <= 5 for node_id in far), asked)
         self.assertGreater(sum(asked[node_id] for node_id in far), 0)
-        self.assertFalse(any(each.overlay.is_complete for each in fleet.nodes))  # the contacts are only some nodes
+        self.assertFalse(any(each.overlay.is_complete for each in fleet.nodes))  # no node knows all nodes
         routed = self.far(node)
         node._membership.prober.needs_keep_alive = lambda contact: contact == routed
         asked.clear()
@@ -221,9 +221,9 @@ class LargeTests(FleetCase):
         self.assertIn(stranger.node_id, asked)
 
     def test_a_newcomer_says_what_it_was_told(self) -> None:
-        """A node sends the remaining seconds for which the network counts as large.
+        """A node tells a new node for how many more seconds the network counts as large.
 
-        A new node applies the answer immediately.
+        The new node applies this answer immediately.
         """
         fleet = self.large()
         node = fleet.nodes[3]
@@ -278,7 +278,7 @@ class LargeTests(FleetCase):
         self.assertEqual({len(node.overlay.members) for node in fleet.nodes[:8]}, {7})
 
     def test_values_are_kept(self) -> None:
-        """After a quarter of the nodes failed, a stored record is readable, and the new closest nodes store it."""
+        """After a quarter of the nodes failed, a record is still readable, and is stored by the closest nodes left."""
         fleet = self.large()
         key = fleet.nodes[2].identity.node_id
         self.assertGreaterEqual(self.done(fleet, fleet.nodes[1].put(key, "a", b"1"), 2.0), 5)
@@ -312,7 +312,7 @@ class ProbeIntervalTests(SynchronousTestCase):
         self.assertEqual(self.pace.silence_s, MIN_SILENCE_S)
 
     def test_it_follows_what_is_seen(self) -> None:
-        """For usual session lengths the interval adapts until about one in twenty pinged contacts has failed."""
+        """For usual session lengths the ping interval adapts until about one in twenty pinged contacts has failed."""
         dice = random.Random(1)
         for stay in (600.0, 1500.0, 4000.0):
             gone = asked = 0

@@ -56,7 +56,7 @@ class LeaseTests(FleetCase):
     def test_the_shorter_one_is_told(self) -> None:
         """A node with a long and a short lease renews at the short interval.
 
-        After the release of the short lease, at the long one.
+        After it released the short lease, it renews at the long interval.
         """
         fleet = self.fleet(2)
         fleet.nodes[1].put(KEY, "long", b"x", "leased", lease=60.0)
@@ -68,7 +68,7 @@ class LeaseTests(FleetCase):
         self.assertEqual(self.told(fleet, 0, 60.0), [60.0] * 3)
 
     def test_who_has_the_long_one_only(self) -> None:
-        """A replica that stores only the long lease of an owner receives renewals at the long interval."""
+        """A replica that stores only records with the long lease receives renewals at the long interval."""
         fleet = self.fleet(10)
         fleet.run(3.0)
         owner = fleet.nodes[1]

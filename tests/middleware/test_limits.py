@@ -47,7 +47,7 @@ PATCHED = (
 # These tables have separate limits, which are larger than ``CROWD``.
 OTHERS: tuple[str, ...] = ("_members", "_listed_at", "_requests", "_peers", "sessions", "_responses", "_unconfirmed")
 OTHERS += ("_contacts", "_store", "_entries", "_live", "_absent")
-OTHERS += ("_switchboard._names", "_switchboard._untraced")  # These tables belong to the simulation.
+OTHERS += ("_switchboard._names", "_switchboard._untraced")  # These tables belong to the simulation, not to a node.
 
 
 class PageTests(FleetCase):
@@ -116,7 +116,7 @@ class CrowdTests(FleetCase):
 
 
 def walk(thing: Any, path: str, sizes: dict[str, int], seen: set[int]) -> None:
-    """Record the size of every table that is reachable from a node."""
+    """Record the size of every table that can be reached through the attributes of a node."""
     if id(thing) in seen or isinstance(thing, str | bytes | int | float | random.Random | type):
         return
     seen.add(id(thing))

@@ -1,4 +1,4 @@
-"""Tests of one iterative lookup, and of the XOR metric."""
+"""Tests of the iterative lookup and of the XOR metric."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class LookupTest(SynchronousTestCase):
             self.assertEqual((lookup.take_next(), lookup.closest()), ([], []))
 
     def test_slow_frees_its_place(self) -> None:
-        """A slow contact permits further queries.
+        """While a contact is slow to reply, the lookup queries further contacts.
 
         The lookup still waits for this contact, and replaces it if it fails.
         """

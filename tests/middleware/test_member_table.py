@@ -36,7 +36,7 @@ class MemberTableTests(SynchronousTestCase):
     def test_coming_and_going(self) -> None:
         """A lost member is absent until it is heard, and a member that left is removed.
 
-        The digest covers the members.
+        The digest of the table changes with its members.
         """
         self.fill(3)
         before = self.members.digest()
@@ -51,7 +51,7 @@ class MemberTableTests(SynchronousTestCase):
         self.assertEqual((len(self.members), self.members.list_absent()), (2, []))
 
     def test_a_majority_strikes_soon(self) -> None:
-        """A majority in touch removes absent members early, a minority only after ``MAX_ABSENT_S``."""
+        """A node in touch with a majority removes absent members early, other nodes only after ``MAX_ABSENT_S``."""
         for lost, wait in ((2, ABSENT_WITH_MAJORITY_S), (3, MAX_ABSENT_S)):
             self.members = MemberTable(ME.node_id)
             self.fill(4)

@@ -84,7 +84,7 @@ class MessageTests(SynchronousTestCase):
         self.assertEqual(found, by_the_table(kind, fields))
 
     def test_refuses_what_is_out_of_shape(self) -> None:
-        """Deep nesting, extension types, false lengths, map keys that are not text, and other input are rejected."""
+        """Any other input is rejected, such as deep nesting, extension types, wrong lengths and non-text map keys."""
         deep: object = 1
         deep_maps: object = 1
         for _ in range(40):

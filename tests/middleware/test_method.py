@@ -74,7 +74,7 @@ class RequestHistoryTests(SynchronousTestCase):
         self.assertEqual(len(self.history), 5)
 
     def test_word_that_was_overtaken(self) -> None:
-        """A late message with a lower number of the oldest open request does not reopen settled requests."""
+        """If a late message names an older request as the oldest open one, settled requests stay settled."""
         self.history.forget_before(ANN, 7, 1.0)
         self.history.forget_before(ANN, 4, 1.0)
         self.assertTrue(self.history.is_settled(ANN, 5))

@@ -28,7 +28,7 @@ class NodeCase(FleetCase):
         return [record.value for record in self.done(fleet, fleet.nodes[place].get(key), within)]
 
     def watched(self, node: EntangledNode, **options: Any) -> list[list[bytes | None]]:
-        """Return a list that will contain all notifications of a watch."""
+        """Start a watch; return a list that will contain all its notifications."""
         told: list[list[bytes | None]] = []
         node.watch(KEY, lambda records: told.append([r.value for r in records]), **options)
         return told
@@ -153,7 +153,7 @@ class LeaseTests(NodeCase):
         self.assertEqual([r.value for r in fleet.stores[0].get(KEY)], [b"here"])
 
     def test_replica_lets_go_of_what_it_holds_in_vain(self) -> None:
-        """A replica removes a leased record within a few renewals if the owner no longer has this record."""
+        """If the owner no longer has a leased record, its replicas remove the record within a few renewals."""
         fleet = self.fleet(3)
         old = Record(KEY, "old", fleet.nodes[2].identity.public, 1, "leased", 1.0, b"old").sign(fleet.identity(2))
         fleet.nodes[2].put(KEY, "state", b"here", "leased")
@@ -164,7 +164,7 @@ class LeaseTests(NodeCase):
     def test_short_silence_ends_no_lease(self) -> None:
         """A partition of half a lease removes no leased record.
 
-        A longer partition does, and the records return after it.
+        A longer partition removes them, and they return when the partition ends.
         """
         fleet = self.fleet(3)
         fleet.nodes[2].put(KEY, "state", b"here", "leased")
@@ -230,7 +230,7 @@ class WatchTests(NodeCase):
         self.assertEqual(len(self.flushLoggedErrors(IndexError)), 1)
 
     def test_push_by_a_stranger(self) -> None:
-        """Pushes from replicas without a subscription, and invalid pushes, are ignored."""
+        """A node ignores invalid pushes, and pushes from replicas at which it has no subscription."""
         fleet = self.fleet(3)
         told = self.watched(fleet.nodes[2])
         fleet.run(0.5)
@@ -322,7 +322,7 @@ class KeepTests(NodeCase):
         self.page, self.dog = self.order[-1], self.order[-2]
 
     def test_copies_follow_what_is_seen(self) -> None:
-        """If a node watches with ``keep``, it has the key's records in its store even if it is not a holder."""
+        """A node that watches a key with ``keep`` has the key's records in its store, even if it is not a holder."""
         store = self.page.store
         self.dog.put(KEY, "state", b"here", "leased")
         self.world.run(1.0)
@@ -413,7 +413,7 @@ class LargeFleetTests(NodeCase):
         self.assertEqual([r.value for r in heir.store.get(KEY)], [b"do it"])
 
     def test_former_replicas_do_not_count(self) -> None:
-        """When new nodes become holders of a key, watchers discard the reports of its former holders."""
+        """When new nodes become holders of a key, watchers of the key discard the reports of the former holders."""
         fleet = self.fleet(10, seed=8)
         self.done(fleet, fleet.nodes[0].put(KEY, "task", b"do it"))
         told = self.watched(fleet.nodes[0])
@@ -443,7 +443,7 @@ class JoinTests(NodeCase):
         self.assertEqual(len(fleet.nodes[0].overlay.table), 1)
 
     def test_known_to_oneself_only(self) -> None:
-        """If the only known node of a bootstrap node is its own address, it is the first node of its network."""
+        """A bootstrap node that knows only its own address becomes the first node of its network."""
         fleet = self.fleet(1)
         node = fleet.make_node(1)
         fleet.nodes.append(node)

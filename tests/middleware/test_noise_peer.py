@@ -47,7 +47,7 @@ class Run:
         return self.statics[1]
 
     def other(self, is_initiator: bool) -> Any:
-        """Return one side of the handshake in the reference implementation."""
+        """Return the initiator or responder of the reference implementation."""
         name = b"Noise_IKpsk1_25519_ChaChaPoly_BLAKE2s" if self.psk else b"Noise_IK_25519_ChaChaPoly_BLAKE2s"
         side = NoiseConnection.from_name(name)
         own = 0 if is_initiator else 1

@@ -57,7 +57,7 @@ class OverlayTests(FleetCase):
                     self.assertLessEqual(others, {c.node_id for c in node.overlay.find_possible_replicas(key)})
 
     def test_one_sign_of_life_is_as_good_as_many(self) -> None:
-        """A repeated message from a contact changes nothing, unless the contact is suspected or has moved."""
+        """A repeated message from a contact changes nothing, unless the contact is suspected or has a new address."""
         fleet = self.fleet(3)
         overlay, other = fleet.nodes[0].overlay, fleet.nodes[1].contact
         seen: list[Contact] = []
@@ -76,7 +76,7 @@ class OverlayTests(FleetCase):
         self.assertEqual(seen, [other] * 3 + [moved])
 
     def test_the_found_are_kept_in_mind(self) -> None:
-        """A contact in the routing table that is offline does not displace holders that a lookup has found."""
+        """An offline contact in the routing table does not displace holders that a lookup has found."""
         fleet = self.fleet(14, seed=2)
         node, key = fleet.nodes[0], hash_key("a")
         node.overlay.has_all_members = False
@@ -90,7 +90,7 @@ class OverlayTests(FleetCase):
         self.assertLessEqual(others, {c.node_id for c in node.overlay.find_possible_replicas(key)})
 
     def test_the_silent_go(self) -> None:
-        """A node that fails is removed from every table after a while, a node that stops immediately."""
+        """A node that fails is removed from every table after a while; a node that stops is removed immediately."""
         fleet = self.fleet(4)
         fleet.nodes[3].stop_silently()
         fleet.nodes[2].stop()
@@ -150,7 +150,7 @@ class NewcomerTests(SynchronousTestCase):
         return Deferred.fromCoroutine(self.overlay.wait_for_members())
 
     def look(self, work: Deferred[Any], news: Callable[[], None], step: float) -> bool:
-        """Return whether ``work``, which is waiting, ends at the first check after ``news``."""
+        """Check that ``work`` waits. Then call ``news``, and return whether ``work`` ends at the next check."""
         self.clock.advance(3.5 * step)
         self.assertNoResult(work)
         news()
@@ -173,7 +173,7 @@ class NewcomerTests(SynchronousTestCase):
     def test_meeting_waits_for_the_team(self) -> None:
         """``met`` waits for the complete member list, or the knowledge that the team is large.
 
-        One member is not enough.
+        To hear one member is not enough.
         """
         for news in (self.knows_all, self.knows_many):
             self.forget()

@@ -30,7 +30,7 @@ ANYTHING = st.recursive(
 
 class RecordTest(SynchronousTestCase):
     def test_which_holds(self) -> None:
-        """The higher sequence number wins; of two records with equal numbers all replicas choose the same record."""
+        """The record with the higher sequence wins; if sequences are equal, all replicas choose the same record."""
         one, other = record(value=b"1"), record(value=b"2")
         self.assertTrue(record(sequence=2).supersedes(one))
         self.assertFalse(one.supersedes(record(sequence=2)))

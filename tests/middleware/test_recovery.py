@@ -81,7 +81,7 @@ class CorruptFileTest(SynchronousTestCase):
         damages: tuple[tuple[Callable[[], object], str], ...] = (
             (lambda: self.overwrite(0, b"\x5a" * 100), lost),  # the header
             (lambda: self.overwrite(0, random.Random(1).randbytes(4096)), ""),  # the first page
-            (lambda: self.overwrite(68, b"\1\2\3\4"), saved),  # the header has another application id
+            (lambda: self.overwrite(68, b"\1\2\3\4"), saved),  # the application id of another program
             (lambda: self.overwrite(4096 * 12, b"\xff" * 4096 * 4), saved),
             (lambda: os.truncate(self.path, os.path.getsize(self.path) // 2), ""),
             (lambda: Path(self.path).write_bytes(bytes(40_960)), lost),  # as an SD card does after a power failure
@@ -151,7 +151,7 @@ class CorruptFileTest(SynchronousTestCase):
                 self.assertEqual([r for r in store.records() if r.value != bytes(500)], [])
                 self.assertIn(store.get_note("identity"), (DOG.seed, None))
                 seen.add(f"{store.origin}, {store.corrupt_rows > 0}")
-                # If a record were lost without a report, it would seem that it had never been written.
+                # A record that is lost without a report would look as if it had never been written.
                 lost = 200 - len(store)
                 self.assertTrue(
                     not lost or store.origin == "replaced" or store.corrupt_rows >= lost, (lost, store.corrupt_rows)

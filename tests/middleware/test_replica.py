@@ -136,7 +136,7 @@ class ReplicaTests(SynchronousTestCase):
     def test_lease_runs_out(self) -> None:
         """A leased record expires one TTL after its last renewal.
 
-        Its owner is marked as silent only by the end of a lease.
+        The owner is marked as silent only when a lease ends.
         """
         self.stored(record(lifetime="leased"), record("t"))
         self.clock.advance(0.8)
@@ -157,14 +157,14 @@ class ReplicaTests(SynchronousTestCase):
         self.assertEqual(self.store.get(KEY), [])
 
     def test_goodbye(self) -> None:
-        """A goodbye ends the leases and watches of the peer but keeps its team records."""
+        """A goodbye ends the leases and watches of its sender; the team records of the sender stay."""
         self.stored(record(lifetime="leased"), record("t"))
         self.replica.answer_goodbye(self.dog)
         self.assertEqual([r.name for r in self.store.get(KEY)], ["t"])
         self.assertEqual(self.told[2:], [("gone", "state"), ("silent", DOG.public)])
 
     def test_missing(self) -> None:
-        """If the owner's digest differs, it gets the list of held leases after its second renewal.
+        """If the owner's digest differs, the owner gets the list of held leases after its second renewal.
 
         If all its leases have expired, it gets the list immediately.
         """
@@ -267,7 +267,7 @@ class StoreReplyTests(SynchronousTestCase):
 
     @given(st.integers() | st.booleans() | st.none() | st.floats() | st.text() | st.binary())
     def test_total(self, foreign: Any) -> None:
-        """Any other reply is decoded as None, for instance a sequence lower than the sequence of the record."""
+        """Any other reply is decoded as None, such as one with a lower sequence than the record's."""
         reply = decode_reply(foreign, RECORD)
         is_valid = type(foreign) is int and (-4 <= foreign <= 0 or 7 <= foreign < MAX_SEQUENCE)
         self.assertEqual(reply is not None, is_valid)

@@ -91,13 +91,13 @@ class TurnTests(EndpointCase):
         self.assertEqual(self.places(), (0, 0, 0))
 
     def test_long_questions_take_no_place(self) -> None:
-        """Requests with a long timeout do not block short ones."""
+        """Requests with a long timeout do not block requests with a short timeout."""
         for one in self.flood(2 * MAX_IN_FLIGHT, timeout=60.0):
             one.addErrback(lambda failure: None)
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 7), 2 * DELAY), 7)
 
     def test_the_queue_is_bounded(self) -> None:
-        """A request fails at once if the queue is full."""
+        """If the queue is full, a further request fails immediately."""
         self.patch(requester, "MAX_QUEUED", 3)
         asked = self.flood(MAX_IN_FLIGHT + 5)
         for one in asked[-2:]:

@@ -84,14 +84,14 @@ class RoutingTableTest(SynchronousTestCase):
         self.assertEqual(self.table.record_contact(self.new[0], 30.0), self.old[2])
 
     def test_no_flood_of_pings(self) -> None:
-        """For many new contacts the old contact is returned for a ping only once per ``PING_INTERVAL_S``."""
+        """The old contact is returned for a ping once per ``PING_INTERVAL_S``, even if there are many new contacts."""
         self.fill()
         asked = [self.table.record_contact(newcomer, 10.0) for newcomer in self.new]
         self.assertEqual(asked, [self.old[0]] + [None] * 7)
         self.assertEqual(self.table.record_contact(self.new[0], 10.0 + PING_INTERVAL_S), self.old[0])
 
     def test_replaced_from_the_cache(self) -> None:
-        """After ``STALE_AFTER`` consecutive failures the most recent waiting contact replaces the old contact."""
+        """After ``STALE_AFTER`` consecutive failures of a contact, the most recent waiting contact replaces it."""
         self.fill()
         for newcomer in self.new[:2]:
             self.table.record_contact(newcomer, 10.0)
@@ -185,7 +185,7 @@ class RoutingTableTest(SynchronousTestCase):
 
     @given(st.integers(0, 159), st.integers())
     def test_refresh_target_lies_in_its_bucket(self, index: int, seed: int) -> None:
-        """The lookup target for a bucket is in this bucket, and the seed determines it."""
+        """The lookup target for a bucket is in this bucket, and is determined by the seed."""
         table = RoutingTable(OWN.node_id)
         target = table.refresh_target(index, random.Random(seed))
         self.assertEqual(bucket_index(OWN.node_id, target), index)

@@ -90,7 +90,7 @@ class ReopenTest(SynchronousTestCase):
         self.assertEqual(store.expire(160.0), kept)
 
     def test_what_left_stays_away(self) -> None:
-        """A record that expired, or lost against another record, is absent after a restart.
+        """A record that expired, or was superseded by another record, is absent after a restart.
 
         A record that was put again is present.
         """
@@ -152,7 +152,7 @@ class ReopenTest(SynchronousTestCase):
             self.assertEqual(connection.execute("SELECT count(*) FROM rotten").fetchone(), (MAX_CORRUPT_ROWS,))
 
     def test_rotten_note(self) -> None:
-        """A corrupted note is counted and not returned, even if it is the identity."""
+        """A corrupted note is counted and not returned, even if it contains the node's identity."""
         self.store.set_note("identity", DOG.seed)
         self.store.set_note("contacts", b"some")
         self.store.close()
@@ -184,7 +184,7 @@ class ReopenTest(SynchronousTestCase):
         self.assertEqual(store.usage.bytes, sum(map(count_bytes, kept)))
 
     def test_killed_in_the_middle(self) -> None:
-        """At each durability level flushed records survive if the process is killed during later writes."""
+        """At each durability level, flushed records survive even if the process is killed during later writes."""
         late = "for number in range(300): store.put(record('late' + str(number), value=None), 9e9)\n"
         levels: tuple[Durability, ...] = ("power", "crash")
         for durable in levels:
@@ -201,7 +201,7 @@ class ReopenTest(SynchronousTestCase):
         self.assertEqual(self.store._connection.execute("PRAGMA synchronous").fetchone(), (2,))
 
     def test_one_node_a_file(self) -> None:
-        """A second node cannot open a file in use, and can open it after the first one closed it."""
+        """A second node cannot open a file in use; when the first node has closed the file, the second can open it."""
         error = self.assertRaises(BadStore, SqliteStore.open, self.path, 0.0)
         self.assertIn(f"another node uses it (process {os.getpid()})", str(error))
         self.after_restart()
@@ -271,7 +271,7 @@ class FullDiskTest(SynchronousTestCase):
         self.store.flush()
         self.assertEqual(self.store.write_error, "")
         self.successResultOf(self.store.wait_for_write())
-        self.assertEqual(len(read_records(self.store._path, KEY)), 61)  # including the changes that were pending
+        self.assertEqual(len(read_records(self.store._path, KEY)), 61)  # with the changes that were pending before
 
     def test_read_only(self) -> None:
         """A file that becomes read-only rejects records like a full disk, and recovers."""

@@ -53,7 +53,7 @@ class StoreContract(_Case):
         self.store = self.make(100)
 
     def test_empty(self) -> None:
-        """A new store reports that it is new and is empty."""
+        """A new store is empty, and reports that it is new."""
         self.assertEqual((self.store.origin, self.store.corrupt_rows, len(self.store.epoch)), ("new", 0, 8))
         self.assertEqual(len(self.store), 0)
         self.assertEqual(self.store.get(KEY), [])
@@ -161,7 +161,7 @@ class StoreContract(_Case):
         self.assertRaises(Full, store.put, record("c", value=bytes(600)), FOREVER)
 
     def test_one_owner_leaves_as_much_as_it_has(self) -> None:
-        """An owner may use half of the free rows and bytes, and in any case a small number."""
+        """An owner may use half of the free rows and bytes, and always a small minimum of them."""
         for rows, octets, value in ((1000, MAX_BYTES, b""), (10_000, 1_000_000, bytes(10_000))):
             store = self.make(rows, octets)
             shares = [self.fill(store, owner, value) for owner in (DOG, CAT)]
@@ -172,7 +172,10 @@ class StoreContract(_Case):
             self.assertTrue(store.put(record("1", sequence=2, value=b""), FOREVER))
 
     def test_room_of_an_owner_comes_back(self) -> None:
-        """Tombstones count for their owner; only the owner's old tombstones are evicted for its new records."""
+        """Tombstones count for their owner.
+
+        If an owner's new records need space, only its own old tombstones are evicted.
+        """
         store = self.make(1000, hold=30.0)
         store.put(record("old", value=None, owner=CAT), 60.0)
         for number in range(499):
@@ -261,7 +264,7 @@ class MemoryStoreTest(StoreContract, SynchronousTestCase):
         return MemoryStore(max_rows, max_bytes, hold)
 
     def test_expiries_do_not_pile_up(self) -> None:
-        """The heap of expiry times stays proportional to the number of stored records."""
+        """The size of the heap of expiry times stays proportional to the number of stored records."""
         store = MemoryStore()
         for sequence in range(1, 1001):
             store.put(record(sequence=sequence), FOREVER - sequence)

@@ -57,7 +57,7 @@ class StreamsTests(EndpointCase):
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def test_age_counts_from_the_camera(self) -> None:
-        """The age of a frame is its age when it was sent plus its transfer time, without synchronized clocks."""
+        """The age of a frame is its age at sending plus its transfer time; this needs no synchronized clocks."""
         self.viewer.view(self.to_publisher, CAMERA, self.see)
         self.clock.advance(0.1)
         self.publisher.publish(CAMERA, 1, bytes(2 * PART_BYTES), 0.25)
@@ -89,7 +89,7 @@ class StreamsTests(EndpointCase):
         self.assertEqual(self.switchboard.counters["sent"], sent)
 
     def test_lost_part_drops_the_frame(self) -> None:
-        """A frame with a lost fragment is dropped, and so is an older frame that arrives late.
+        """A frame with a lost fragment is dropped; an older frame that arrives late is dropped, too.
 
         No frame is shown twice.
         """

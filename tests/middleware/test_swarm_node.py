@@ -163,7 +163,10 @@ class SwarmNodeTests(FleetCase):
             self.failureResultOf(asked, Refused)
 
     def test_operator(self) -> None:
-        """A message from an operator is delivered and shown; a disconnect order is executed after its reply."""
+        """A message from an operator is delivered and shown.
+
+        A device replies to a disconnect order and then executes it.
+        """
         fleet = self.swarm(2)
         texts: list[str] = []
         gone: list[float] = []
@@ -198,7 +201,7 @@ class SwarmNodeTests(FleetCase):
         self.assertEqual(gone, [])
 
     def test_contact_of(self) -> None:
-        """``contact_of`` returns the announced address of a device, and None for an invalid one."""
+        """``contact_of`` returns the announced address of a device, or None if this address is invalid."""
         fleet = self.swarm(1)
         node: SwarmNode = fleet.nodes[0]
         rows = {
@@ -217,7 +220,7 @@ class SwarmNodeTests(FleetCase):
         self.assertIsNone(node.find_contact(replace(record, value=b"?")))
 
     def test_too_much_to_say(self) -> None:
-        """A presence that exceeds the size of a record is logged as an error, and the node continues to run."""
+        """If the presence of a device does not fit into a record, an error is logged, and the node continues to run."""
         fleet = self.swarm(1)
         fleet.nodes[0].presence.change(capabilities={"arm": {"kind": "x" * 2000}})
         fleet.run(1.0)

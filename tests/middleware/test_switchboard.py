@@ -70,7 +70,7 @@ class SwitchboardTests(SynchronousTestCase):
         self.assertApproximates(len(late) / len(self.got), 0.1, 0.02)
 
     def test_cut_one_way(self) -> None:
-        """A one-way cut and a barrier drop datagrams in one direction, also those in transit, until ``heal``."""
+        """Until ``heal``, a one-way cut and a barrier drop all datagrams in one direction, also those in transit."""
         for close in (
             lambda: self.switchboard.cut(self.a.address, self.b.address, one_way=True),
             lambda: self.switchboard.barriers.append(lambda source, to: source == self.a.address),

@@ -9,7 +9,7 @@ from middleware.entangled.token_bucket import TokenBucket
 
 class TokenBucketTests(SynchronousTestCase):
     def test_so_many_at_once_and_so_many_a_second(self) -> None:
-        """A full bucket permits a burst, by default one second of its rate; it refills up to its capacity."""
+        """A full bucket permits a burst (by default the tokens of one second), and refills up to its capacity."""
         bucket = TokenBucket(2.0)
         self.assertEqual([bucket.take(0.0) for _ in range(3)], [True, True, False])
         bucket = TokenBucket(2.0, 3.0)

@@ -224,7 +224,7 @@ class TunnelTests(TunnelCase):
         self.assertEqual(server.peers, [])
 
     def test_port_in_use(self) -> None:
-        """A port in use raises ``PortInUse``, and a joint network then opens neither of its networks."""
+        """A port in use raises ``PortInUse``; then a network that joins UDP and tunnels opens neither of them."""
         self.made()
         stream = self.pipes.make_transport(HOST, 443)
         other = TunnelNetwork(stream, self.clock, random.Random(1), is_served=True)
@@ -246,7 +246,7 @@ class TunnelTests(TunnelCase):
         self.assertIn(b"Proxy-Authorization: Basic bWU6c2VjcmV0\r\n", relay.asked)
 
     def test_proxy_says_no(self) -> None:
-        """If the proxy rejects the request or sends an invalid reply, the tunnel sets a fault and does not open."""
+        """After a rejection or an invalid reply of the proxy, the proxy layer sets ``fault`` and does not open."""
         for answer in (
             b"HTTP/1.1 407 Proxy Authentication Required\r\n\r\n",
             b"SSH-2.0-box\r\n\r\n",
@@ -261,7 +261,7 @@ class TunnelTests(TunnelCase):
 
 
 class QueueLimitTests(TunnelCase):
-    """Tests of the load on a tunnel server by slow readers, incomplete handshakes and strangers."""
+    """Tests of a tunnel server under load by slow readers, incomplete handshakes and unknown peers."""
 
     def test_slow_reader(self) -> None:
         """For a peer that does not read, at most 64 KiB are queued, and the newest datagrams are dropped."""
@@ -386,7 +386,7 @@ class QueueLimitTests(TunnelCase):
         self.assertEqual((len(client.peers), len(server.peers)), (1, 1))
 
     def test_full_house(self) -> None:
-        """If all connections are in use, a new connection replaces the connection of a stranger, never of a member."""
+        """If all connections are in use, a new one replaces the connection of an unknown peer, never of a member."""
         server, served = self.made(is_plain=True)
         members = []
         for n in range(MAX_TOTAL_CONNECTIONS - 1):
@@ -413,7 +413,10 @@ class QueueLimitTests(TunnelCase):
 
 class JointTests(TunnelCase):
     def test_pick_by_address(self) -> None:
-        """A joint network sends to tunnel addresses by tunnel and to others by UDP, with one receiver for both."""
+        """A joint network sends to tunnel addresses by tunnel and to other addresses by UDP.
+
+        It has one receiver for both.
+        """
         switchboard = Switchboard(self.clock, random.Random(1))
         server, served = self.made()
         plain = switchboard.make_network("10.0.0.9", 7000)
@@ -485,7 +488,7 @@ class TlsTests(SynchronousTestCase):
             self.assertEqual(came, b"in the clear" * 3000)
 
     def test_fault(self) -> None:
-        """Input that is not TLS, and a modified record, set a fault and raise no exception."""
+        """After input that is not TLS, or a modified record, the TLS layer sets ``fault`` and raises no exception."""
         self.server.decode(b"GET / HTTP/1.1\r\n\r\n")
         self.assertIn("TLS", self.server.fault)
         self.assertEqual(self.server.decode(b"more")[0], b"")

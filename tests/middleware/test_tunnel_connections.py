@@ -42,7 +42,7 @@ class TunnelConnectionsTests(TunnelCase):
         return [float(times) for times in seen.values()], max(gap, self.clock.seconds() - last)
 
     def three(self) -> tuple[TunnelNetwork, Heard, TunnelNetwork, Heard, Pipe]:
-        """Return two ends that have three connections because the first connection stalled, and this connection."""
+        """Return two ends of a tunnel with three connections, and the first connection, which has stalled."""
         client, came, server, served = self.pair()
         (first,) = self.pipes.streams
         first.is_stalled = True
@@ -75,7 +75,7 @@ class TunnelConnectionsTests(TunnelCase):
         self.assertEqual(len(self.pipes.dialled), 1)
 
     def test_stream_that_stands_still(self) -> None:
-        """If a stream stalls, two more are opened; within 0.5 s all datagrams use two working streams."""
+        """If a connection stalls, two more are opened; within 0.5 s all datagrams use the two working connections."""
         client, _, server, served = self.pair()
 
         (address,) = server.peers
@@ -128,7 +128,7 @@ class TunnelConnectionsTests(TunnelCase):
         self.assertEqual((set(times), len(times)), ({1.0}, 50))
 
     def test_little_waits_in_what_stands_still(self) -> None:
-        """Few datagrams wait in a stalled stream; others, which would arrive too late, are dropped."""
+        """Few datagrams wait in a stalled stream; datagrams that would arrive too late are dropped."""
         client, _, _, served = self.pair()
         (only,) = self.pipes.streams
         self.pipes.cut(HOST)
@@ -181,7 +181,7 @@ class TunnelConnectionsTests(TunnelCase):
     def test_caps_allow_for_it(self) -> None:
         """Each member of a team behind one address may have three connections.
 
-        At the limit these are reduced before a new connection is rejected.
+        At the limit the server closes some of these connections before it rejects a new one.
         """
         server, served = self.made()
         members = [self.member(server, served, "10.0.0.2") for _ in range(MAX_PER_HOST)]

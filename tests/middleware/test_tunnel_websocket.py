@@ -124,7 +124,7 @@ class UrlTests(SynchronousTestCase):
             self.assertTrue(address.is_virtual and not Address("10.0.0.1", 7000).is_virtual)
 
     def test_proxy(self) -> None:
-        """The usual values of ``https_proxy``, with a login, are parsed, and no error message contains the login."""
+        """The usual values of ``https_proxy`` are parsed, also with a login; no error message contains the login."""
         for text, parts in (
             ("http://10.0.0.1:8080", ("10.0.0.1", 8080, "")),
             ("proxy:3128/", ("proxy", 3128, "")),

@@ -78,7 +78,7 @@ class WatchTests(SynchronousTestCase):
         self.watch = Watch(KEY, self.told.append, self.ended.append)
 
     def test_tell_changes_only(self) -> None:
-        """The subscriber receives each change once."""
+        """The subscriber is notified of each change once."""
         self.watch.update()
         self.watch.view.replace(CAT.node_id, [record(DOG)])
         self.watch.update()
@@ -102,7 +102,7 @@ COUNT = 10
 
 class SubscriberTests(FleetCase):
     def asked(self, fleet: EntangledTeam) -> list[tuple[int, float | None]]:
-        """Return a list that will contain the holder and the optional TTL of each later watch request."""
+        """Return a list that will contain the holder and the TTL (or None) of each later watch request."""
         asked: list[tuple[int, float | None]] = []
         for place, node in enumerate(fleet.nodes):
 
@@ -165,7 +165,7 @@ class SubscriberTests(FleetCase):
         self.assertEqual(sorted(r.value or b"" for r in told[-1]), [b"x", b"y"])
 
     def test_where_all_are_full(self) -> None:
-        """A watcher that exceeds the limit of a key reads the key every two seconds instead."""
+        """If a key already has the maximum number of watchers, a further watcher reads the key every two seconds."""
         fleet = self.fleet(COUNT)
         fleet.run(3.0)
         dice = random.Random(1)

@@ -29,7 +29,7 @@ DOG = identity("dog")
 
 class CertificateTests(SynchronousTestCase):
     def test_granted_by_the_operator(self) -> None:
-        """A grant of the operator makes the key in it a member, and no other key."""
+        """A grant of the operator makes only the key in this grant a member."""
         shown = wrap_grant(granted(OPERATOR, "dog", "device", "gateway"))
         member = verify_certificate(OPERATOR.public, DOG.public, shown)
         self.assertEqual((member.name, member.roles), ("dog", ("device", "gateway")))
@@ -44,7 +44,7 @@ class CertificateTests(SynchronousTestCase):
         self.assertEqual(member, Member(*expected, uses=1, since=NOW, life=invite.life))
 
     def test_renewed_by_a_bootstrap_node(self) -> None:
-        """A renewal postpones the expiry of a certificate, by grant or by code, and can itself be renewed."""
+        """A renewal postpones the expiry of a certificate from a grant or a join by code, and can be renewed itself."""
         vaio, grant = identity("vaio"), granted(OPERATOR, "vaio", "bootstrap")
         for shown in (wrap_grant(granted(OPERATOR, "dog")), admitted(OPERATOR, "dog")):
             before = verify_certificate(OPERATOR.public, DOG.public, shown)
@@ -103,7 +103,7 @@ class CertificateTests(SynchronousTestCase):
         self.assertEqual(member.check_dates(member.not_after), "expired")
 
     def test_guest(self) -> None:
-        """A gateway can admit a guest for one day; a member without that role cannot, and a guest cannot."""
+        """A gateway can admit a guest for one day; a member that is not a gateway cannot, nor can a guest."""
         page, phone, friend = identity("page"), identity("phone"), identity("friend")
         own = wrap_grant(granted(OPERATOR, "page", "gateway"))
         shown = issue_guest_certificate(page, own, phone.public, "phone", NOW)

@@ -31,7 +31,7 @@ class CodeTests(SynchronousTestCase):
         )
 
     def test_every_slip_is_noticed(self) -> None:
-        """Any single wrong character, and any two swapped characters, are reported as mistyped."""
+        """A code with one wrong character, or with two swapped characters, is reported as mistyped."""
         letters = self.code.text.replace("-", "")
         slips = [letters[:at] + other + letters[at + 1 :] for at in range(20) for other in join_code.ALPHABET]
         for first in range(20):

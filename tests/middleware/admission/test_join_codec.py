@@ -38,7 +38,7 @@ def signer(name: str = "vaio", role: str = "bootstrap", code: JoinCode = CODE) -
 
 
 def welcomed(by: Signer | None = None) -> bytes:
-    """Return a join reply (JOIN_REPLY); with a different ``by`` it is not valid."""
+    """Return a join reply (JOIN_REPLY) signed by ``by``, or by default by the valid signer."""
     return join_codec.make_reply(INVITE.public, HEARD, JOIN_REPLY, by or signer(), random.Random(2))
 
 
@@ -98,7 +98,7 @@ class JoinCodecTests(SynchronousTestCase):
     def test_refusals_have_names(self) -> None:
         """A rejection arrives with its code, or with "unknown" for an unrecognized code.
 
-        A hint is decoded as a hint.
+        A hint (an unsigned rejection) is decoded as a hint.
         """
         for code, meant in (("used", "used"), ("silly", "unknown")):
             said = join_codec.make_refusal(INVITE.public, HEARD, code, signer(), random.Random(2))
@@ -122,7 +122,7 @@ class JoinCodecTests(SynchronousTestCase):
     @given(st.recursive(st.integers(0, 99) | st.binary(max_size=70) | st.text(max_size=5), st.lists, max_leaves=20))
     @settings(max_examples=200, deadline=None)
     def test_a_bootstrap_node_may_sign_anything(self, body: object) -> None:
-        """A signed reply with any other content is decoded as a rejection or raises ``Malformed``."""
+        """A signed reply with arbitrary content is decoded as a rejection or raises ``Malformed``."""
         whole = join_codec._sign_body(INVITE.public, HEARD, msgpack.packb(body), signer())
         said = join_codec._encrypt_reply(INVITE.public, EPHEMERAL, whole, random.Random(2))
         with contextlib.suppress(Malformed):

@@ -31,7 +31,7 @@ class MembershipTests(SynchronousTestCase):
         self.assertEqual(self.path.stat().st_mode & 0o777, 0o600)
 
     def test_what_is_no_membership(self) -> None:
-        """A missing file, and a file with other content, of another kind or of another team, raise an error."""
+        """A missing file, invalid content, a key file of another kind and a file of another team raise an error."""
         self.assertIn("cannot be read", self.refusal(self.path))
         foreign = operator(2).create_membership("vaio", ("device",), NOW, random.Random(1))
         wrong = self.membership.to_json() | {"pass": foreign.certificate.hex()}

@@ -62,7 +62,7 @@ class MembershipListTests(SynchronousTestCase):
     @given(st.permutations(range(7)))
     @settings(max_examples=60, deadline=None)
     def test_order_of_renewals(self, order: list[int]) -> None:
-        """Lists converge for any order of renewals, a later grant and a revocation, after they were compared."""
+        """Two lists that receive renewals, a later grant and a revocation in any order are equal after a comparison."""
         vaio, grant, later = identity("vaio"), granted(OPERATOR, "vaio", "bootstrap"), NOW + 300 * 86_400
         found = [grant, pack_admission(CAT, admitted(OPERATOR, "cat")), granted(OPERATOR, "dog")]
         for name, shown, moment in (

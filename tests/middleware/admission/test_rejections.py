@@ -47,7 +47,7 @@ class RejectionTests(VillageCase):
         self.assertEqual(sum("rejected by the invitation" in formatEvent(event) for event in said), 1)
 
     def test_copy_of_a_store(self) -> None:
-        """If a copy of a node starts later, it supersedes the first node; the first node and its peers log this."""
+        """A copy of a node that starts later supersedes the first node; the first node and its peers log this."""
         village = self.village()
         dog = village.welcome("dog")
         village.run(3.0)

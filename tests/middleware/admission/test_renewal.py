@@ -23,7 +23,10 @@ class Years(Village):
             self.run(STEP_S)
 
     def end_of(self, house: House, at: int = 0) -> int:
-        """Return the expiry of the certificate of ``house`` in the membership list of the node with index ``at``."""
+        """Return when the certificate of ``house`` expires.
+
+        The date is read from the membership list of the node with index ``at``.
+        """
         member = self.houses[at].team.admission.find_member(house.public)
         assert member is not None
         return member.not_after
@@ -90,7 +93,7 @@ class YearAndAHalfTests(YearsCase):
 
 class LargeTeamTests(YearsCase):
     def test_not_in_sight(self) -> None:
-        """In a large team a bootstrap node renews a member that is not a contact only if it finds it by a lookup."""
+        """In a large team a bootstrap node renews members that are not its contacts only if a lookup finds them."""
         years = self.years(bootstraps=1)
         vaio, dog, cat = years.houses[:3]
         years.close(cat, is_sudden=True)

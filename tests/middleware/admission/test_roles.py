@@ -195,6 +195,6 @@ class TeamTests(SynchronousTestCase):
 
         self.patch(assembly, "SwarmNode", make)
         outcome = run_trial(partial(SimulatedTeam, others=("looker",)), 2, 3)
-        # The council may include the viewer, whose role forbids this method.
+        # The council may include the viewer, whose role forbids ``lease.freed``.
         self.assertEqual(set(refusals) - {((VIEWER,), "lease.freed")}, set())
         self.assertEqual((outcome.broken, bool(outcome.found)), ([], True))

@@ -75,12 +75,15 @@ class AdmissionServerTests(SynchronousTestCase):
         """A repeated datagram gets the same reply, from any source address, and does not use the code again."""
         said = self.knocked()
         self.server.on_request(said, DOOR)
-        self.taken = Deferred()  # A request for a further use would wait for this Deferred.
+        self.taken = Deferred()  # A second use of the code would wait for this Deferred.
         self.server.on_request(said, Address("10.0.0.3", 1))
         self.assertEqual(self.sent[0][0], self.sent[1][0])
 
     def test_answer_under_way(self) -> None:
-        """If the use of a code is not decided yet, further requests of the newcomer wait; then it gets one reply."""
+        """Repeated requests of a newcomer wait until the use of its code is decided.
+
+        Then the newcomer gets one reply.
+        """
         self.taken = Deferred()
         for dice in range(3):
             self.server.on_request(self.knocked(dice), DOOR)

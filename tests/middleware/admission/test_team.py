@@ -59,9 +59,9 @@ class JoiningTests(VillageCase):
         self.assertEqual(self.successResultOf(knocked).member.name, "dog")
 
     def test_member_that_is_no_bootstrap(self) -> None:
-        """A plain member rejects a newcomer with "role".
+        """A member that is not a bootstrap node rejects a newcomer with the code "role".
 
-        After its promotion it admits the newcomer without a restart.
+        After the promotion to bootstrap node, this member admits the newcomer without a restart.
         """
         village = self.village()
         dog = village.welcome("dog")
@@ -163,7 +163,7 @@ class RotationTests(VillageCase):
         self.assertEqual(self.refusal(village, pig.node.call, houses[2]), "")
 
     def slept(self, grace: float, seconds: float) -> int:
-        """Return the number of the secret of a member that was off from before a rotation to ``seconds`` after it."""
+        """Return the number of the team secret of a member that was off during a rotation and ``seconds`` after it."""
         village = self.village()
         dog = village.welcome("dog")
         village.run(2.0)
@@ -220,7 +220,7 @@ class StrangersTests(VillageCase):
         self.assertEqual(sum("swarm doctor SETTINGS" in formatEvent(event) for event in said), 1)
 
     def test_expired_member(self) -> None:
-        """A member is removed when its certificate expires, even in an open session."""
+        """A member is removed when its certificate expires, even if it has an open session."""
         village = self.village()
         code, packed, terms = village.signer.invite(
             "dog", ("device",), 1, village.wall(), 3600.0, village.dice, life=30.0

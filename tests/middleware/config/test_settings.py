@@ -203,7 +203,7 @@ class SettingsTest(SynchronousTestCase):
         self.assertRaises(BadSetting, settings().with_flags, deployment_allow="yes")
 
     def test_tunnels(self) -> None:
-        """By default each remote known node has a tunnel on port 443; configured tunnels come first."""
+        """By default the node uses a tunnel on port 443 to each remote known node; configured tunnels come first."""
         known = ["10.0.0.7:7000", "127.0.0.1:7000", "10.0.0.7:7001", "[fe80::1]:7000"]
         found = [str(url) for url in settings(known_nodes=known).node.tunnel_urls]
         self.assertEqual(found, ["wss://10.0.0.7/swarm", "wss://[fe80::1]/swarm"])

@@ -67,7 +67,7 @@ class RendezvousTests(SynchronousTestCase):
                 self.assertLessEqual(longest, max(math.dist(near, p) for p in points) + 1e-9)
 
     def test_median(self) -> None:
-        """The median minimizes the sum of distances, even if it is one of the points."""
+        """The median minimizes the sum of distances, even if the median is one of the points."""
         for seed in range(60):
             dice = random.Random(seed)
             points = [(float(dice.randint(0, 9)), float(dice.randint(0, 9))) for _ in range(dice.randint(1, 7))]

@@ -16,7 +16,7 @@ from benchmarks.consensus.plot import AFTER, BAR, CALM, draw_svg
 
 class BenchConsensusTests(SynchronousTestCase):
     def test_missions_are_seeded(self) -> None:
-        """Equal seeds give equal missions, with and without failing agents."""
+        """The same seed gives the same mission, with and without failing agents."""
         one, again, other = Mission(20, 20, 1), Mission(20, 20, 1), Mission(20, 20, 2)
         self.assertEqual((one.costs, one.items), (again.costs, again.items))
         self.assertNotEqual(one.costs, other.costs)
@@ -61,7 +61,7 @@ class BenchConsensusTests(SynchronousTestCase):
         self.assertGreater(rows["cbba"]["messages"], rows["cbba + exchange"]["messages"])
 
     def test_plot(self) -> None:
-        """The plot is drawn from JSON rows; its bars are proportional to the cost above the optimum."""
+        """The plot is drawn from JSON rows. The length of each bar is proportional to the cost above the optimum."""
         row = {"agents": 3, "strategy": "a < b", "ratio": 1.1, "ratio_failed": 1.2}
         picture = draw_svg(json.loads(json.dumps([row])))
         self.assertIn("a &lt; b", picture)

@@ -15,7 +15,7 @@ Costs = dict[str, dict[str, float]]
 
 
 def flat(row: dict[str, float]) -> Score:
-    """Return a score that does not depend on the tasks in the bundle."""
+    """Return a score that does not depend on the agent's other tasks (its bundle)."""
     return lambda bundle, task: 1000.0 - row[task]
 
 
@@ -41,7 +41,7 @@ class Talk:
                 return
             number = self.dice.randrange(len(self.way))
             sender, taker, said = self.way[number]
-            if self.dice.random() < 0.8:  # otherwise the message is delivered again later
+            if self.dice.random() < 0.8:  # a message that is not removed here is delivered again later
                 del self.way[number]
             corrections = self.bidders[taker].receive(sender, said)
             if corrections:
@@ -83,7 +83,7 @@ class BidderTests(SynchronousTestCase):
             self.assertEqual(winners, expected)
 
     def test_warped(self) -> None:
-        """With scores that grow with the bundle, bids do not increase within a bundle, and all bidders converge."""
+        """Even if scores grow with the size of the bundle, bids never increase in it, and all bidders converge."""
         for seed in range(40):
             dice = random.Random(seed)
             names, goals = [f"a{n}" for n in range(5)], [f"t{n}" for n in range(6)]

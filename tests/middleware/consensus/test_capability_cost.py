@@ -32,7 +32,7 @@ class CapabilityCostTests(SynchronousTestCase):
     @settings(max_examples=100)
     @given(seconds, shares, st.integers(0, 9), seconds, shares, st.integers(1, 9))
     def test_monotone(self, way: float, battery: float, load: int, more: float, less: float, tasks: int) -> None:
-        """A greater distance, a lower battery or more tasks never lower the weight of a report."""
+        """A greater distance, a lower battery level or more tasks never make the weight of a report lower."""
         report = Report("a", way, battery=battery, load=float(load))
         weight = self.strategy.weigh(report)
         self.assertGreaterEqual(self.strategy.weigh(replace(report, cost=way + more)), weight)
@@ -49,7 +49,7 @@ class CapabilityCostTests(SynchronousTestCase):
         self.assertEqual((found.assigned_agent, found.standby), ("b", ("a", "c")))
 
     def test_own_reports(self) -> None:
-        """Of two reports of one device the lower weight counts, not the shorter distance."""
+        """Of two reports of one device, the one with the lower weight counts, even if its distance is longer."""
         tired, fresh = Report("a", 5.0, battery=0.2), Report("a", 6.0)
         self.assertEqual(self.strategy.merge([tired], [fresh]), (fresh,))
         self.assertEqual(self.strategy.find([tired, fresh, Report("b", 10.0)]).assigned_agent, "a")

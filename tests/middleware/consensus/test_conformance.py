@@ -42,7 +42,7 @@ class GuardedTests(Conformance, SynchronousTestCase):
 
 
 def point(order: Sequence[Report]) -> Consensus:
-    """Return a consensus on these reports, in the order of their rank."""
+    """Return a consensus that ranks the agents in the order of these reports."""
     if not order:
         return Consensus(None)
     names = list(dict.fromkeys(r.agent for r in order))
@@ -143,14 +143,14 @@ class Greedy(Cbba):
 
 
 class Lazy(Cbba):
-    """Omits the last task."""
+    """Assigns all tasks except the last one."""
 
     def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
         return super().find_group(contacts, items)[: len(items) - 1]
 
 
 class Peeks(CapabilityCost):
-    """Reads the battery level without declaring it."""
+    """Reads the battery level, although its declared fields do not include the battery level."""
 
     reads = ("load",)  # type: ignore[assignment]
 

@@ -79,9 +79,9 @@ class DecisionRecordTests(SynchronousTestCase):
         self.assertEqual(copied is not None and copied.agent, identity(2).node_id.hex())
 
     def test_many_reports_are_the_best_and_a_count(self) -> None:
-        """A record contains up to thirty reports; of more reports it contains the best eight and the number.
+        """A record contains all reports if there are at most thirty.
 
-        The size of the record is limited.
+        Otherwise it contains the best eight reports and the number of all reports. The size of the record is limited.
         """
         for n, written in ((MAX_REPORTS, MAX_REPORTS), (MAX_REPORTS + 1, MAX_BEST_REPORTS), (500, MAX_BEST_REPORTS)):
             members = [member(i, float(i)) for i in range(1, n + 1)]

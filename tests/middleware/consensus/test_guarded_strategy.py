@@ -62,7 +62,7 @@ class Moody(Nearest):
 
 
 class OrderBound(Nearest):
-    """Chooses the first report, whatever the order is."""
+    """Chooses the first report, so the result depends on the order of the reports."""
 
     name = "order_bound"
 
@@ -161,7 +161,7 @@ class GuardedStrategyTests(SynchronousTestCase):
             self.assert_falls_back(GuardedStrategy(Lying(lie)), why)
 
     def test_mutable_state(self) -> None:
-        """A strategy that returns two results for equal reports is detected in the same or the next call."""
+        """If a strategy gives different results for equal reports, this is detected in the same or the next call."""
         self.assert_falls_back(GuardedStrategy(Moody(), twice=True), "different results")
         later = GuardedStrategy(Moody())
         self.assertEqual(later.find(TEAM).assigned_agent, "b")
@@ -169,7 +169,7 @@ class GuardedStrategyTests(SynchronousTestCase):
         self.flushLoggedErrors()
 
     def test_order(self) -> None:
-        """A strategy that depends on the order of reports is detected, or always gets the reports in a fixed order."""
+        """The guard detects a strategy that depends on the order of reports, or passes the reports in a fixed order."""
         self.assert_falls_back(GuardedStrategy(OrderBound(), twice=True), "different results")
         self.assertEqual(GuardedStrategy(OrderBound()).find(TEAM), GuardedStrategy(OrderBound()).find(TEAM[::-1]))
 

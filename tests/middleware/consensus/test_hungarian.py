@@ -21,7 +21,7 @@ class HungarianTests(SynchronousTestCase):
     def test_against_every_assignment(self) -> None:
         """The assignment has the lowest cost; of several such assignments it is the first.
 
-        This also applies to huge costs.
+        Both hold for huge costs, too.
         """
         dice = random.Random(1)
         for _ in range(400):
@@ -35,7 +35,7 @@ class HungarianTests(SynchronousTestCase):
     def test_prices_prove_it(self) -> None:
         """The prices prove that the assignment is optimal.
 
-        Each row has its cheapest column, and unassigned columns have price 0.
+        Each row is assigned the column with the lowest cost minus price; unassigned columns have price 0.
         """
         dice = random.Random(2)
         for _ in range(200):

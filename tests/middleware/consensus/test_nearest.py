@@ -43,7 +43,7 @@ class NearestTests(SynchronousTestCase):
         self.assertLessEqual(set(named), lawful)
 
     def test_improves(self) -> None:
-        """An offer improves only if it is nearer by more than the hysteresis; an invalid cost never improves."""
+        """An offer is an improvement if it is nearer by more than the hysteresis, but not if its cost is invalid."""
         rows = [
             (1.0, 0.89, True),
             (1.0, 0.9, False),

@@ -75,7 +75,7 @@ class StrategyTests(SynchronousTestCase):
             self.assertEqual(refusal(good), "")
 
     def test_newest_epoch_stands(self) -> None:
-        """Bids of an earlier epoch do not count; of several bids of an agent in one epoch, the lowest counts."""
+        """Bids of an earlier epoch do not count. If an agent has several bids in one epoch, the lowest bid counts."""
         old, first, later = Report("a", 0.0), Report("a", 5.0, epoch=2), Report("a", 4.0, epoch=2)
         other = Report("b", 9.0, epoch=2)
         self.assertEqual(standing([old, other, first, later]), (later, other))
@@ -91,7 +91,7 @@ class StrategyTests(SynchronousTestCase):
         self.assertTrue(Nearest().improves(Report("a", 1.0, unmet=("has no camera",)), Report("b", 9.0), 0.1))
 
     def test_digest(self) -> None:
-        """The digest does not depend on the order of the reports; it changes with a cost or an agent."""
+        """The digest does not depend on the order of the reports, but changes if a cost or an agent changes."""
         a, b, c = Report("a", 1.0), Report("a", 2.0), Report("b", 1.0)
         self.assertEqual(digest_of([a, b, c]), digest_of([c, b, a]))
         self.assertEqual(len({digest_of(each) for each in ([a, c], [b, c], [a], [])}), 4)

@@ -55,7 +55,7 @@ class WeightedVoteTests(SynchronousTestCase):
         self.assertEqual(len(digests), 2)
 
     def test_all_have_voted(self) -> None:
-        """When all have voted, the option with the most weight wins even without a majority; a hash breaks ties."""
+        """When all agents have voted, the option with the most weight wins without a majority; a hash breaks ties."""
         votes = [
             vote(name, choice) for name, choice in zip("abcde", ["red", "red", "blue", "blue", "green"], strict=True)
         ]
@@ -71,7 +71,7 @@ class WeightedVoteTests(SynchronousTestCase):
         self.assertEqual(self.vote.find([*present[:2], Report("c", 1.0, choice="red")]).choice, "red")
 
     def test_two_quorums_never_differ(self) -> None:
-        """No two subsets of the votes lead to different decisions."""
+        """Two subsets of the same votes never lead to different decisions."""
         for seed in range(300):
             dice = random.Random(seed)
             weights = [dice.choice([1.0, 2.0, 3.0]) for _ in range(7)]

@@ -67,7 +67,10 @@ class ConversionTests(SynchronousTestCase):
 
     @given(st.text())
     def test_what_a_terminal_is_shown(self, text: str) -> None:
-        """Control characters become spaces in text, and in JSON escapes that are parsed as the original characters."""
+        """Control characters become spaces in text.
+
+        In JSON they become escapes, which are parsed as the original characters.
+        """
         self.assertTrue(conversion.remove_control_characters(text).isprintable())
         self.assertEqual(len(conversion.remove_control_characters(text)), len(text))
         written = conversion.format_json({text: [text]})

@@ -98,7 +98,7 @@ class HealthTests(FleetCase):
         self.assertEqual(said["address"], str(fleet.address(1)))
 
     def test_links(self) -> None:
-        """Small requests measure each peer's round-trip time; a failed peer does not answer."""
+        """Small requests measure each peer's round-trip time; for a failed peer the measurement reports no answer."""
         fleet = self.fleet(3, weather=LinkConditions(delay_s=0.02))
         fleet.run(3.0)
         fleet.kill(2)

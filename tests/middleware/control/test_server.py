@@ -93,7 +93,7 @@ class ControlTests(SynchronousTestCase):
         self.assertEqual(self.answer("dht get", key=f"id:{key}"), [])
 
     def test_compare_and_set(self) -> None:
-        """A put that expects a sequence other than the current sequence fails with ``Conflict``."""
+        """A put fails with ``Conflict`` if the sequence number that it expects is not the current one."""
         self.answer("dht put", key="a", value="1", expect=0)
         self.assertEqual(self.ask("dht put", key="a", value="2", expect=0)["error"], "Conflict")
 
@@ -192,7 +192,7 @@ class ControlTests(SynchronousTestCase):
         self.assertEqual(len(self.lines(transport)[0]["answer"]), 3)
 
     def test_connections_are_bounded(self) -> None:
-        """A connection beyond the limit gets the error ``Busy``; when a connection is closed, a new one is accepted."""
+        """A connection beyond the limit gets the error ``Busy``; after one is closed, the next one is accepted."""
         connections = [self.opened() for _ in range(MAX_CONNECTIONS)]
         _, transport = self.opened()
         self.assertEqual(self.lines(transport)[0]["error"], "Busy")
@@ -210,7 +210,7 @@ class ControlTests(SynchronousTestCase):
     def test_node_lives_without_a_socket(self) -> None:
         """If the path is in use, the node logs this and continues to run.
 
-        A stopped service closes all its connections.
+        When the control service stops, it closes all its connections.
         """
         port = ControlServer(Listener(refuses=True), Path("/run/a.control"), self.verbs)
         port.startService()

@@ -91,7 +91,7 @@ class DeploymentTests(FleetCase):
         return 0 if held is None else held.version
 
     def assert_refused(self, words: str, runs: int = 0) -> None:
-        """Check that the dog logs ``words``, has not run the rejected code, and runs version ``runs``."""
+        """Check that the dog logs ``words``, has not run the rejected code, and still runs version ``runs``."""
         said = " | ".join(text for _, text in self.dog.presence.device.messages)
         self.assertIn(words, said)
         self.assertEqual(self.running, runs)
@@ -193,7 +193,7 @@ class DeploymentTests(FleetCase):
         self.assertNotIn("\x1b", "".join(text for _, text in self.dog.presence.device.messages))
 
     def test_restart_loads_from_the_shelf(self) -> None:
-        """After a restart the accepted version runs without any peer; the store contains two editions."""
+        """After a restart the accepted version runs without any peer; the store contains it and the previous one."""
         held = None
         for number in (1, 2, 3):
             held, source = self.version(number, held)

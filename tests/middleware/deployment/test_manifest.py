@@ -44,7 +44,7 @@ def versions(n: int) -> list[Manifest]:
 
 class ManifestTests(SynchronousTestCase):
     def test_survives_the_wire(self) -> None:
-        """A packed manifest is unpacked unchanged, with its history, and is not larger than a record may be."""
+        """A packed manifest is unpacked unchanged, with its history, and fits into a record."""
         for manifest in (*versions(9), make_rollback(versions(9)[-1])):
             assert manifest is not None
             self.assertEqual(parse_manifest(record_of(manifest)), manifest)

@@ -14,7 +14,7 @@ class FileModuleStoreTests(SynchronousTestCase):
         self.folder = Path(self.mktemp()) / "deployed"
 
     def test_keeps_and_drops(self) -> None:
-        """Both implementations list the stored entries in the order of their names, without the dropped entries."""
+        """Both implementations of the store list the entries in the order of their names, without dropped entries."""
         stores: list[ModuleStore] = [FileModuleStore(self.folder), MemoryModuleStore()]
         for store in stores:
             self.assertEqual(store.list_modules(), [])

@@ -144,7 +144,7 @@ class RunnerTests(SynchronousTestCase):
     def test_instances(self) -> None:
         """An instance of a behaviour is created, called and dropped.
 
-        If its process ends, the instance ends with the same reason.
+        If the process ends, the instance ends with the same reason.
         """
         runner = self.runner(self.good, BEHAVIOUR)
         instance = runner.create({"turns": 1}, random.Random(1))
@@ -182,7 +182,7 @@ class RunnerTests(SynchronousTestCase):
         self.assertRaises(module_channel.ProcessEnded, runner.send_request, "call", [], lambda is_well, content: None)
 
     def test_twin(self) -> None:
-        """The runner without a process loads, decides and rejects like the runner with a process."""
+        """The runner that uses no process loads, decides and rejects in the same way as the runner with a process."""
         runner = Runner(make_next_manifest("best", STRATEGY, NEAREST, None), NEAREST, make_memory_channel, lambda: 0.0)
         runner.start()
         runner.poll()

@@ -65,7 +65,7 @@ class ExplanationTests(SynchronousTestCase):
         self.assertEqual([(d.name, d.what) for d in ruling.differ], [("dog2", "has no decision record")])
 
     def test_order_does_not_matter(self) -> None:
-        """The explanation does not depend on the order of the decision records; the newest epoch comes first."""
+        """In any order of the decision records the explanation is the same and lists the newest epoch first."""
         records = [decided(n, THREE, epoch) for epoch in (1, 2, 3) for n in (1, 2, 3)]
         records[4] = decided(2, THREE[:1] + [THREE[1]], 2)
         expected = explain_decisions(records)
@@ -76,7 +76,7 @@ class ExplanationTests(SynchronousTestCase):
             self.assertEqual(explain_decisions(records), expected)
 
     def test_most_decide_whoever_dissents(self) -> None:
-        """If two agents agree, they outvote the third agent; this holds for each of the three agents."""
+        """Two agents that agree outvote the third agent, for each of the three as dissenter."""
         for lone in (1, 2, 3):
             records = [decided(n, THREE, assigned=1 if n == lone else None) for n in (1, 2, 3)]
             (ruling,) = explain_decisions(records).epochs
@@ -84,14 +84,14 @@ class ExplanationTests(SynchronousTestCase):
             self.assertEqual([(d.name, d.what) for d in ruling.differ], [(f"dog{lone}", "names dog1")])
 
     def test_even_votes_give_the_lowest(self) -> None:
-        """If two agents choose each other, the agent with the lower uuid wins, and the other is listed as different."""
+        """If each of two agents names itself, the winner with the lower uuid counts, and one agent agrees."""
         first, second = decided(1, THREE, assigned=1), decided(2, THREE, assigned=2)
         (ruling,) = explain_decisions([first, second]).epochs
         self.assertEqual(ruling.winner, min(first.winner, second.winner))
         self.assertEqual(len(ruling.agree), 1)
 
     def test_nothing_decided(self) -> None:
-        """Without decision records the explanation is empty; for an epoch without a winner it returns ``nobody``."""
+        """Without decision records the explanation is empty. For an epoch without a winner the choice is ``nobody``."""
         self.assertEqual(format_explanation(explain_decisions([])), "")
         (ruling,) = explain_decisions([decided(1, [member(1, None)])]).epochs
         self.assertEqual((ruling.winner, ruling.chosen), ("", "nobody"))

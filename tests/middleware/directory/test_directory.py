@@ -102,7 +102,7 @@ class Neighbour:
         return self.table.get(key, concern)
 
     def put(self, key: bytes, name: str, value: bytes, lifetime: str, lease: float) -> Deferred[None]:
-        """Write a record, or renew its lease from now on."""
+        """Write a record, or renew its lease; the lease starts now."""
         self.sequence += 1
         slot = Slot(key, self.identity.public, name)
         record = Record(key, name, self.identity.public, self.sequence, "leased", lease, value, bytes(64))
@@ -278,7 +278,10 @@ class DirectoryTests(FleetCase):
             self.assertTrue(neighbour.identity.public in seen or is_missed)
 
     def test_some(self) -> None:
-        """With one prefix a page lists the whole team, otherwise a few prefixes; successive pages cover the team."""
+        """A page lists the whole team if there is one prefix, and a few prefixes otherwise.
+
+        Successive pages cover the team.
+        """
         town = Town(9)
         town.come(30, 0.1)
         reader, before = town.neighbours[7], town.table.reads

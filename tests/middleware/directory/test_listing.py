@@ -53,7 +53,7 @@ def listed(places: Places, listing: Listing, silent: frozenset[bytes] = frozense
 
 class ListingTests(SynchronousTestCase):
     def test_everybody_once(self) -> None:
-        """All devices are listed once, with one read per prefix, whatever depth the reader assumes."""
+        """Every device is listed once, with one read per prefix, whatever depth the reader assumes at first."""
         depths = dict.fromkeys(owners(600), 5)
         for floor in (0, 3, 5):
             listing = listed(announced(depths), Listing(floor))
@@ -87,7 +87,7 @@ class ListingTests(SynchronousTestCase):
             self.assertEqual(len(listed(announced(depths), Listing(floor)).records), 620)
 
     def test_some_know_sooner_that_the_team_is_small(self) -> None:
-        """If most of 40 devices have returned to the root key, the others, up to two depths below, are still listed."""
+        """If most of 40 devices have returned to the root key, devices at up to two depths below are still listed."""
         team = owners(40)
         for deep in (1, 2):
             depths = {owner: deep if derive_node_id(owner)[0] >> 7 != DEVICES[0] >> 7 else 0 for owner in team}
@@ -137,7 +137,7 @@ class ListingTests(SynchronousTestCase):
         self.assertLessEqual({o for o in depths if under.has(derive_node_id(o))}, {r.owner for r in listing.records})
 
     def test_what_is_open_is_not_over(self) -> None:
-        """If an answer is pending, the listing is neither over nor complete."""
+        """While the answer to a read is pending, the listing is neither over nor complete."""
         listing = Listing(1)
         self.assertFalse(listing.is_over)
         self.assertEqual(listing.take_next(), ROOT)

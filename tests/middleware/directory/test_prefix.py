@@ -46,7 +46,7 @@ class PrefixTests(SynchronousTestCase):
                 self.assertTrue(place.has(place.first) and place.first <= node_id)
 
     def test_halves(self) -> None:
-        """One half of a prefix has the same key as the prefix, the other half a new key.
+        """When a prefix is split, one half keeps the key of the prefix, and the other half has a new key.
 
         Each id is in exactly one half.
         """
@@ -73,7 +73,7 @@ class PrefixTests(SynchronousTestCase):
         self.assertEqual(choose_depth(UNDIVIDED_AGAIN, 1), 0)
 
     def test_hysteresis(self) -> None:
-        """From any depth the depth converges to the right one, and small changes of the team size change no depth."""
+        """From any depth a device reaches the right depth; small changes of the team size do not change the depth."""
         for exponent in range(1, MAX_DEPTH):
             size = MIN_DEVICES_PER_PLACE * 2.0**exponent * 1.4
             if size <= MAX_UNDIVIDED:

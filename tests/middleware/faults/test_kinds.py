@@ -22,7 +22,7 @@ class FaultTests(SynchronousTestCase):
         self.assertEqual(parse_fault("kill", None, 0), Fault("kill"))
 
     def test_begins(self) -> None:
-        """A device answers with the delay until its fault starts; an invalid answer counts as no delay."""
+        """A device replies with the delay until its fault starts; an invalid reply counts as no delay."""
         self.assertEqual(parse_delay(0.5), 0.5)
         for answer in (None, "soon", True, -1.0, 3600.0, math.nan, math.inf, [0.5]):
             self.assertEqual(parse_delay(answer), 0.0)
@@ -58,7 +58,7 @@ class TakeoverTests(SynchronousTestCase):
         self.assertEqual((clock.seconds, clock.to), (1.5, "b"))
 
     def test_end(self) -> None:
-        """The measurement does not start without a task, and ends a limited time after the fault."""
+        """The measurement of a takeover does not start without a task, and ends a limited time after the fault."""
         self.assertFalse(Takeover("a", "", 10.0, 14.0).is_open(10.1))
         clock = Takeover("a", "t1", 10.0, 14.0)
         self.assertTrue(clock.is_open(14.0))

@@ -23,7 +23,7 @@ class FaultyNetworkTests(SynchronousTestCase):
         self.other.listen(lambda datagram, source: self.answers.append(datagram))
 
     def exchange(self, seconds: float = 0.01, times: int = 1) -> tuple[int, int]:
-        """Send ``times`` datagrams in each direction; return the numbers that the node received and sent."""
+        """Send ``times`` datagrams in each direction; return how many the node and its peer received."""
         before = len(self.came), len(self.answers)
         for _ in range(times):
             self.other.send(b"in", self.network.address)
@@ -34,7 +34,7 @@ class FaultyNetworkTests(SynchronousTestCase):
     def test_changes_nothing_as_made(self) -> None:
         """Without a fault all datagrams pass immediately in both directions.
 
-        The address of the inner network is used.
+        The faulty network has the address of the network that it wraps.
         """
         self.assertEqual(self.network.address.host, "127.0.0.1")
         self.assertEqual(self.exchange(0.0, 20), (20, 20))

@@ -94,7 +94,7 @@ class Sites:
         return kind if kind in ("none", "carried") else "direct"
 
     def call(self, a: EntangledNode, contact: Contact, timeout: float | None = None) -> tuple[Any, float]:
-        """Call ``contact`` from ``a``; return the reply and its delay in seconds."""
+        """Call ``contact`` from ``a``; return the reply and the seconds until it arrived."""
         began, ended = self.clock.seconds(), [float("nan")]
         outcome: Deferred[Any] = a.call(contact, "echo", 7, timeout=timeout)
         outcome.addBoth(self._note, ended)

@@ -53,7 +53,7 @@ class QuietTests(SitesCase):
 
 
 class HostileTests(SitesCase):
-    """Attacks by members that lie or send too many requests."""
+    """Attacks by members that send false addresses or too many requests."""
 
     def setUp(self) -> None:
         """Create a public node and two nodes that know it."""
@@ -98,7 +98,7 @@ class HostileTests(SitesCase):
         self.assertEqual(self.g.call(c, contact)[0], 7)
 
     def test_nobody_to_ask(self) -> None:
-        """A call to a relayed node fails like any unanswered call if no peer knows this node; it leaves no state."""
+        """If no peer knows a relayed node, a call to this node fails like any unanswered call and leaves no state."""
         stranger = Identity(b"s" * 32)
         answer, seconds = self.g.call(self.a, Contact(stranger.public, relayed_address(stranger.node_id)))
         self.assertIn("no answer", str(answer))
@@ -109,7 +109,7 @@ class HostileTests(SitesCase):
         self.assertEqual(len(self.a.endpoint.peers._handshakes), 0)
 
     def test_outside(self) -> None:
-        """Behind a symmetric router two peers observe two different ports, behind other types the same port."""
+        """Two peers observe two different ports of a node behind a symmetric router, and the same port otherwise."""
         for site, kind, ports in (("c", "port", 1), ("d", "sym", 2)):
             c = self.g.at(site, kind)
             self.g.run(2.0)
@@ -124,7 +124,7 @@ class IntroductionLimitsTests(SynchronousTestCase):
     """Tests of ``IntroductionLimits``."""
 
     def setUp(self) -> None:
-        """Create introduction limits of which nothing is used."""
+        """Create unused introduction limits."""
         self.clock = HeapClock()
         self.allowance = IntroductionLimits(self.clock)
 
@@ -138,7 +138,10 @@ class IntroductionLimitsTests(SynchronousTestCase):
         self.assertEqual([self.allowance.may_introduce(ASKER) for _ in range(2)], [True, False])
 
     def test_who_is_met_does_not_count(self) -> None:
-        """If an introduced peer replies, its introducer gets one introduction back; the rest return at a fixed rate."""
+        """If an introduced peer replies, its introducer may make one more introduction.
+
+        Unanswered introductions become available again at a fixed rate.
+        """
         while self.allowance.may_meet(ASKER):
             self.allowance.record_introducer(STRANGER, ASKER)
         for public, again in ((OTHER, False), (STRANGER, True), (STRANGER, False)):

@@ -25,7 +25,7 @@ class NatTests(SynchronousTestCase):
     """Tests of ``NatRouter``."""
 
     def test_what_each_kind_lets_in(self) -> None:
-        """After a datagram to host A, each NAT type filters datagrams of A, of A's other port and of another host."""
+        """After a datagram to A, the NAT type decides whether A, another port of its host or another host may reply."""
         kinds: list[tuple[NatKind, list[bool]]] = [
             ("full", [True, True, True]),
             ("addr", [True, True, False]),

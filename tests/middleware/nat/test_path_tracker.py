@@ -23,7 +23,7 @@ UNPUNCHABLE = {frozenset({"port", "sym"}), frozenset({"sym"})}
 
 
 def paths(sites: Sites, one: str, other: str) -> tuple[str, float]:
-    """Return the first path between nodes behind routers of these types, and its delay after they met.
+    """Return the first path between nodes behind routers of these types, and after how long the path was found.
 
     The nodes join one after the other, and learn of each other from the member list of the public node.
     """
@@ -95,7 +95,7 @@ class LossyLinkTests(SitesCase):
                     self.assertEqual((one, other, path), (one, other, "direct"))
 
     def test_late_words(self) -> None:
-        """If one side is notified half a second late, the pair is relayed at first, and later has a direct path."""
+        """If one peer is notified half a second late, the pair is relayed at first, and later has a direct path."""
         for one, other in (("leaky", "port"), ("port", "leaky")):
             for late in "ab":
                 sites = self.sites()
@@ -348,7 +348,7 @@ class KindTests(SynchronousTestCase):
     def test_each_kind_of_address(self) -> None:
         """The address determines relayed, tunnelled and loopback paths.
 
-        A distant address from an introduction counts as punched.
+        The path to a distant address that came from an introduction counts as hole punching.
         """
         kinds = {
             "carried": relayed_address(bytes(20)),

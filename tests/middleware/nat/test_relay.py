@@ -74,7 +74,7 @@ class RelayTests(SynchronousTestCase):
         self.assertEqual(self.counters["uncarried"] + self.counters["malformed"], 6)
 
     def test_a_pair_has_its_share(self) -> None:
-        """A pair can send a burst immediately and then at a limited rate, without an effect on other pairs."""
+        """Each pair may send a burst and then data at a limited rate, independently of other pairs."""
         full = bytes(MAX_DATAGRAM_BYTES)
         self.assertEqual(sum(self.carry(self.a, self.b, full) for _ in range(200)), PAIR_BURST // MAX_DATAGRAM_BYTES)
         self.assertEqual(self.carry(self.b, self.a, full), 0)
@@ -129,7 +129,7 @@ class UpgradeTests(SynchronousTestCase):
         return moments
 
     def test_more_and_more_rarely(self) -> None:
-        """The pauses between attempts increase up to the last one; a change of the local address starts them again."""
+        """The pauses between attempts increase. After a change of the local address they are short again."""
         self.upgrades.add(self.public, False, 0.0)
         self.upgrades.add(self.public, False, 0.9)  # this address was already known
         moments = self.tried(150.0)

@@ -1,6 +1,6 @@
-"""Provide acceptors for tests that apply to both users of Paxos, tuple takes and leases.
+"""Provide acceptors for tests that apply to both protocols built on Paxos: tuple takes and leases.
 
-A use consists of the codec and the terms of such a user.
+A ``Use`` describes one of these protocols.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ TTL = 10.0
 
 @dataclass(frozen=True)
 class Use:
-    """The register key, the proposers and the values of one user of Paxos."""
+    """A protocol built on Paxos, with the register key, the proposers and the values for its tests."""
 
     key: Any
     codec: Codec[Any]

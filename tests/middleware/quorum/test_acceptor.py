@@ -166,34 +166,39 @@ class ReachableTests(SynchronousTestCase):
     ) -> None:
         """Check the invariants of one step.
 
-        ``docs/explanation/quorum.md`` explains the labels in the comments.
+        The labels in the comments are the invariants in ``docs/explanation/quorum.md``.
         """
         case = event, ballot, token, now, before
         lives = use.codec.lives
         is_held = before.lease_until > now and not ballot.is_same_life(before.holder, lives)
         if reply.kind not in (ReplyKind.GRANTED, ReplyKind.SEALED):
             self.assertEqual(self.digest(before, 0), self.digest(after, 0), case)  # a rejection changes nothing
-        self.assertGreaterEqual(after.promised, before.promised, case)  # P1
-        self.assertGreaterEqual(after.accepted, before.accepted, case)  # A1
-        self.assertGreaterEqual(after.token, before.token, case)  # T1
+        self.assertGreaterEqual(after.promised, before.promised, case)  # P1: promises never decrease
+        self.assertGreaterEqual(after.accepted, before.accepted, case)  # A1: acceptances never decrease
+        self.assertGreaterEqual(after.token, before.token, case)  # T1: the token never decreases
         self.assertGreaterEqual(after.released, NO_BALLOT)
         if event == "lease" and reply.kind is ReplyKind.GRANTED:
-            self.assertFalse(is_held, case)  # L1
-            self.assertEqual(before.accepted, NO_BALLOT, case)  # C1
-            self.assertGreater(ballot, before.released, case)  # B3
+            self.assertFalse(is_held, case)  # L1: one holder at a time
+            self.assertEqual(before.accepted, NO_BALLOT, case)  # C1: no lease in a sealed configuration
+            self.assertGreater(ballot, before.released, case)  # B3: no grant to a released ballot
             extends = before.lease_until > now and token == before.token and before.holder > before.released
-            self.assertTrue(ballot >= before.promised or extends, case)  # P1, L4
-            self.assertTrue(token > before.token or ballot.is_same_life(before.holder, lives), case)  # T2
+            # P1: no grant below the promise; L4: except for the extension of a lease
+            self.assertTrue(ballot >= before.promised or extends, case)
+            # T2: a token belongs to one holder
+            self.assertTrue(token > before.token or ballot.is_same_life(before.holder, lives), case)
         if event == "accept" and reply.kind is ReplyKind.GRANTED:
-            self.assertFalse(before.lease_until > now, case)  # C2
-            self.assertTrue(ballot >= before.promised and ballot > before.released, case)  # P1, B3
-            self.assertTrue(not use.terms.must_prepare or before.promised != NO_BALLOT, case)  # R4
+            self.assertFalse(before.lease_until > now, case)  # C2: no acceptance during a lease
+            # P1: no grant below the promise; B3: no grant to a released ballot
+            self.assertTrue(ballot >= before.promised and ballot > before.released, case)
+            # R4: no acceptance before a prepare, if a prepare is required
+            self.assertTrue(not use.terms.must_prepare or before.promised != NO_BALLOT, case)
         if event in ("prepare", "reserve") and reply.kind in (ReplyKind.GRANTED, ReplyKind.SEALED):
-            self.assertEqual(reply.accepted, before.accepted, case)  # A2
+            self.assertEqual(reply.accepted, before.accepted, case)  # A2: a promise carries the accepted ballot
             self.assertEqual(reply.kind is ReplyKind.SEALED, before.accepted != NO_BALLOT, case)
             is_reserved = before.reserved_until > now and not ballot.is_same_life(before.promised, lives)
-            self.assertFalse(is_reserved, case)  # L3
-            self.assertTrue(not is_held or before.is_released or before.lease_until - now <= 0.2 * TTL, case)  # L3
+            self.assertFalse(is_reserved, case)  # L3: a prepare replaces no exclusive promise
+            # L3: no promise to another proposer except near the end of a lease
+            self.assertTrue(not is_held or before.is_released or before.lease_until - now <= 0.2 * TTL, case)
         if event != "release":
             self.assertGreaterEqual(after.lease_until, before.lease_until, case)  # L3: only the holder shortens a lease
         elif is_held:

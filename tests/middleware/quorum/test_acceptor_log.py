@@ -66,7 +66,7 @@ class LogTests(SynchronousTestCase):
         self.assertEqual(self.opened().floor.longest, 9.0)
 
     def test_rotten_notes(self) -> None:
-        """If a stored vote is unreadable, the log uses the other votes and is not whole."""
+        """If a stored vote is unreadable, the log uses the other votes, and reports that it is not whole."""
         granted(self.log, "t", 7, 0.0)
         for corrupt in (b"\xc1", msgpack.packb([1]), msgpack.packb({"t": [1]}), msgpack.packb({"t": 5})):
             for name in filter(self.store.get_note, CODEC.names):
@@ -94,9 +94,9 @@ class LogTests(SynchronousTestCase):
         self.assertEqual(again.floor[:2], (40, 40))
 
     def test_changed_councils_are_not_forgotten(self) -> None:
-        """The register of a changed council is kept while its task is open.
+        """The register of a council that was replaced is kept while its task is open.
 
-        Otherwise the old council could decide again.
+        Without the register the old council could decide again.
         """
         self.patch(module, "MAX_REGISTERS", 1)
         granted(self.log, "t", 1, 0.0).configuration = FIRST_CONFIGURATION + 1

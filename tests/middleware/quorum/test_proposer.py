@@ -24,7 +24,7 @@ def reply(kind: ReplyKind, counter: int = 9, accepted: Ballot = NO_BALLOT, value
 
 class ConcludeTests(SynchronousTestCase):
     def test_conclude(self) -> None:
-        """The replies determine whether a round is won, decided, held, outbid or silent.
+        """The replies determine the outcome of a round, which is won, decided, held, outbid or silent.
 
         A value that was accepted under the highest ballot is completed.
         """

@@ -79,7 +79,7 @@ class RoundTests(SynchronousTestCase):
         self.assertFalse(self.successResultOf(looked.outcome).tally.is_won)
 
     def test_who_is_silent(self) -> None:
-        """A member with any reply counts as present.
+        """A member that has sent any reply counts as present.
 
         A member that has not replied to three requests counts as silent.
         """
@@ -161,12 +161,13 @@ class RoundTests(SynchronousTestCase):
             self.assertEqual(self.successResultOf(asked.outcome).tally.is_won, is_won)
 
     def test_free_in(self) -> None:
-        """``free_in`` is the time until the second of the members' leases ends, by the members' clocks."""
+        """The estimated wait ends when the second of the members' leases ends, according to the members' clocks."""
         asked = self.round()
         self.clock.advance(0.04)
         self.answer(0, Reply(ReplyKind.HELD, remaining=0.2))
         self.answer(1, Reply(ReplyKind.HELD, remaining=0.9))
-        # The third member did not reply, so the second is needed. Its lease counts from the middle of 0.00 and 0.04.
+        # A majority needs the second member, because the third has not replied. The remaining time in its reply counts
+        # from 0.02, the middle between request and reply.
         self.assertAlmostEqual(asked.estimate_wait(), 0.88)
         unheard = self.round()
         self.clock.advance(0.6)

@@ -163,7 +163,7 @@ class TakeAcceptorTests(SynchronousTestCase):
         self.assertEqual(len(self.acceptor), 4)
 
     def test_unsettled(self) -> None:
-        """An accepted take without an outcome is listed after a while, until it is settled or its tuple is removed."""
+        """An accepted take without an outcome is listed after a while, until it is completed or its tuple removed."""
         for number in (1, 2, 3):
             self.store.put(tuple_record(place(number)), 999.0)
             self.claim(place(number))
@@ -192,7 +192,10 @@ class TakeAcceptorTests(SynchronousTestCase):
         self.assertEqual(self._kind(self.successResultOf(answer), Event.PREPARE), ReplyKind.GRANTED)
 
     def test_what_was_accepted_is_told(self) -> None:
-        """A later claim gets the accepted value, one second after the first taker could have completed its take."""
+        """A claim gets the value of an earlier, accepted take after a delay of one second.
+
+        In this time the first taker can still complete its take.
+        """
         self.claim(place(1), 1, b"a", lease=100.0)
         self.assertEqual([self.confirm(place(1)) for _ in range(2)], [ReplyKind.GRANTED] * 2)
         self.assertEqual(self.claim(place(1), 2, b"b"), ReplyKind.HELD)
@@ -223,7 +226,7 @@ class TakeAcceptorTests(SynchronousTestCase):
 
 class TupleRecordTests(SynchronousTestCase):
     def test_round_trip(self) -> None:
-        """A tuple, and the note that it was taken, survive encoding and decoding."""
+        """A tuple, and the record that it was taken, survive encoding and decoding."""
         council = (Member(PEER, b"i" * 8),)
         value = pack_tuple(place(1).mark, ("x", 1, None), council)
         self.assertEqual(parse_record(record(place(1).name, value)), StoredTuple(place(1), ("x", 1, None), council))
@@ -289,7 +292,7 @@ class ResolveTests(SynchronousTestCase):
         return maybeDeferred(getattr(self.acceptors[number], method.replace("decree.", "answer_")), PEER, *arguments)
 
     def begin(self, number: int, counter: int, taker: bytes) -> None:
-        """Let one member accept a take, as if the taker then failed."""
+        """Let one member accept a take, which its taker does not complete."""
         acceptor = self.acceptors[number]
         places: list[object] = [place(1).pack()]
         acceptor.answer_claim(PEER, KEY, places, acceptor.incarnation, counter, taker, 1.0)
@@ -304,7 +307,7 @@ class ResolveTests(SynchronousTestCase):
     def test_own_value_gives_way(self) -> None:
         """A take that only one member accepted may have been decided.
 
-        A later caller completes it and drops its own value.
+        A later caller completes this take and drops its own value.
         """
         self.begin(0, 1, b"a")
         self.silent.add(2)

@@ -69,7 +69,7 @@ class WireTests(SynchronousTestCase):
 
 class NoteTests(SynchronousTestCase):
     def test_old_notes(self) -> None:
-        """Stored promises, leases and accepted values of the previous version are read and written unchanged."""
+        """Promises, leases and accepted values that the previous version stored are read, and are written unchanged."""
         codec, key, owner = CODEC, b"k" * 20, b"o" * 32
         rows = [
             [key, [owner, "one", b"m" * 8], 3, b"a", 2.5, None],

@@ -81,7 +81,7 @@ class TupleSpaceTests(SpaceCase):
             self.assertEqual(len(self.done(fleet, space.read_all(("job", ANY, ANY)))), 2)
 
     def test_equal_tuples_are_several(self) -> None:
-        """A space is a bag, so each of several equal tuples is taken once; other spaces and lengths do not match."""
+        """Each of several equal tuples is taken once; tuples of another space or length do not match."""
         fleet, (a, b, _) = self.spaces(3)
         for space in (a, a, b):
             self.done(fleet, space.put(("same",)), 1.0)
@@ -92,7 +92,7 @@ class TupleSpaceTests(SpaceCase):
         self.assertEqual(self.done(fleet, b.get_many(("same",), 5)), [("same",)] * 3)
 
     def test_stopped_while_several_are_confirmed(self) -> None:
-        """If a space stops before the council confirmed its takes, the call fails, and no unhandled error is logged."""
+        """If a space stops before its takes are confirmed, the waiting call fails, and no unhandled error is logged."""
         fleet, (a, b, _) = self.spaces(3)
         for _ in range(3):
             self.done(fleet, a.put(("same",)), 1.0)
@@ -146,7 +146,7 @@ class TupleSpaceTests(SpaceCase):
     def test_a_council_is_whole(self) -> None:
         """A put waits for silent members, because a smaller council would tolerate no failure.
 
-        If they stay silent, it fails.
+        If these members stay silent, the put fails.
         """
         fleet, (a, *_) = self.spaces(4)
         for node in fleet.nodes[1:]:
@@ -285,7 +285,7 @@ class ClaimTests(SpaceCase):
         self.failureResultOf(claim.confirm(), ClaimLost)
 
     def test_a_dead_taker_gives_back(self) -> None:
-        """The claim of a failed taker ends with its lease, even if the publisher has failed, too."""
+        """The claim of a failed taker ends with the lease of the claim, even if the publisher has failed, too."""
         fleet, spaces = self.spaces(6)
         self.done(fleet, spaces[1].put(("job", 1)), 1.0)
         self._claimed(fleet, spaces[2], lease=3.0)
@@ -311,7 +311,7 @@ class ClaimTests(SpaceCase):
     def test_get_behind_another_call_of_the_same_node(self) -> None:
         """A blocked get takes a tuple after another call of the same node has failed to take it."""
         fleet, (a, b, c) = self.spaces(3)
-        b.read(("bell", int)).addErrback(lambda failure: failure.trap(NotRunning))  # keeps the tuple cache of b open
+        b.read(("bell", int)).addErrback(lambda failure: failure.trap(NotRunning))  # keeps the cache of node b open
         self.done(fleet, a.put(("job", 1)), 1.0)
         self._claimed(fleet, c, lease=4.0)
         at_once, waiting = b.get_if_exists(("job", ANY)), b.get(("job", ANY))

@@ -25,7 +25,7 @@ class SequenceTests(SynchronousTestCase):
             self.assertGreater(counts[name], SEQUENCES // 4, name)
 
     def found(self) -> bool:
-        """Return whether a violation occurs in a few sequences."""
+        """Return whether one of a few sequences violates an invariant."""
         for seed in range(1, BITING + 1):
             try:
                 run(seed, Counter())

@@ -21,7 +21,7 @@ class VacancyTests(SynchronousTestCase):
         self.assertEqual(self.filled("01234", "13", "0265", 5), "02465")
 
     def test_nothing_to_gain(self) -> None:
-        """A council stays unchanged if all members reply, no candidate replies, or a change would improve nothing."""
+        """A council stays unchanged if all members reply, if no candidate replies, or if a change improves nothing."""
         self.assertIsNone(self.filled("012", "", "345"))
         self.assertIsNone(self.filled("012", "1", "02"))
         self.assertIsNone(self.filled("012", "", "3", 5))

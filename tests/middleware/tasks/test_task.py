@@ -79,7 +79,7 @@ class DecoderTests(SynchronousTestCase):
         self.assertEqual(parse_member(record(MEMBER, bare.pack())), bare)
 
     def test_in_another_slot(self) -> None:
-        """A task, report or result is ignored if the name of its slot belongs to another record."""
+        """A task, report or result is ignored if it is in a slot whose name belongs to a different record."""
         self.assertIsNone(parse_task(record("t2", TASK.pack())))
         self.assertIsNone(parse_member(record(RESULT, REPORT.pack())))
         self.assertIsNone(parse_result(record(MEMBER, DONE.pack())))

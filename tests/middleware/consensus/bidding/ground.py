@@ -23,14 +23,14 @@ BEST_EFFORT = Auction("job", 1, COUNCIL, exclusive=False)
 
 
 def bid(place: int, cost: float | None, revision: int = 0, auction: Auction = AUCTION) -> Bid:
-    """Return the signed bid of the agent at ``place``."""
+    """Return the signed bid of the agent with index ``place``."""
     agent = AGENTS[place]
     report = None if cost is None else Report(agent.node_id.hex(), cost)
     return Bid(agent.public, report, revision).sign(agent, auction)
 
 
 def announced(number: int, rank: int, *bids: Bid, auction: Auction = AUCTION) -> Announcement:
-    """Return an announcement, signed by the council member at ``rank``."""
+    """Return an announcement that the council member with this rank signed."""
     entries = tuple(AnnouncedReport(b.report, b.revision) for b in bids if b.report is not None)
     return Announcement(number, rank, entries).sign(AGENTS[rank].sign, auction)
 
@@ -43,7 +43,7 @@ def rule() -> MergeRule:
 def make_participant(
     place: int, auction: Auction = AUCTION, seed: int = 1, on_summary: OnSummary = lambda reports: None
 ) -> Participant:
-    """Return the participant of the node at ``place``, which knows all other nodes."""
+    """Return the participant of the node with index ``place``; this node knows all other nodes."""
     others = [contact for contact in CONTACTS if contact is not CONTACTS[place]]
     dice = random.Random(f"{seed}/{place}")
     return Participant(auction, CONTACTS[place], rule(), lambda: others, dice, AGENTS[place].sign, on_summary)

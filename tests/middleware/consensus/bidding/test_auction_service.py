@@ -47,7 +47,7 @@ class AuctionCase(FleetCase):
         return Auction("job", 1, self.task.council, self.task.strategy, WAITING, **others)
 
     def enter(self, fleet: SwarmTeam, *costs: float) -> list[Bidding]:
-        """Let the nodes bid these costs, each with its own node."""
+        """Let each node bid one of these costs."""
         biddings = []
         for place, cost in enumerate(costs):
             node = fleet.nodes[place]
@@ -197,7 +197,7 @@ class HostileTests(AuctionCase):
             self.assertEqual(self.views[place][-1][0].agent, fleet.nodes[1].uuid)
 
     def test_announcement_in_return_for_a_bid(self) -> None:
-        """An announcement in the answer to a bid is checked like any other."""
+        """An announcement in the answer to a bid is checked like any other announcement."""
         fleet = self.prepared(4)
         self.enter(fleet, 3.0, 1.0)
         node, liar = fleet.nodes[0], self.outsider(fleet)

@@ -63,7 +63,7 @@ class LargeTests(SynchronousTestCase):
         self.assertLessEqual(percentile(run.agreement_times, 0.95), 0.8)
 
     def test_branch_dies_with_what_it_holds(self) -> None:
-        """If a relay fails with unsent bids, each bidder repeats its own bid, so no bid is lost."""
+        """If a relay fails before it forwarded its bids, each bidder repeats its own bid, so no bid is lost."""
         for seed in range(3):
             crowd = AuctionSimulation(100, seed, LinkFaults(), spread=0.02)
             winner = crowd.costs.index(min(crowd.costs))

@@ -75,7 +75,7 @@ class RouteTests(SynchronousTestCase):
 
 class PathChoiceTests(SynchronousTestCase):
     def test_goes_over_once(self) -> None:
-        """The choice between direct bids and the tree has a hysteresis."""
+        """The team size at which bids change between direct and tree has a hysteresis."""
         path_choice = PathChoice()
         paths = [
             path_choice.choose(n)
@@ -92,7 +92,7 @@ class PathChoiceTests(SynchronousTestCase):
         self.assertEqual(path_choice.choose(MAX_DIRECT_BIDDERS), DIRECT)
 
     def test_team_size(self) -> None:
-        """In a small team all contacts are counted.
+        """The size of a small team is counted: a node and its contacts.
 
         The size of a large team is estimated from the density of the nearest nodes.
         """
@@ -106,7 +106,7 @@ class PathChoiceTests(SynchronousTestCase):
         self.assertTrue(1_500 < estimate_team_size(own, known, False) < 12_000)
         newcomer = near[:NEAREST_CONTACTS] + rng.sample(
             near[NEAREST_CONTACTS:], NEAREST_CONTACTS
-        )  # few contacts, but the team counts as large
+        )  # the contacts are few, but the node is told that the team is large
         self.assertTrue(1_500 < estimate_team_size(own, newcomer, True) < 12_000)
         self.assertEqual(estimate_team_size(own, newcomer[: NEAREST_CONTACTS - 1], True), NEAREST_CONTACTS)
 
@@ -135,7 +135,7 @@ class RecipientsTests(SynchronousTestCase):
         self.assertEqual(len(recipients.take_due_notices(announced(2, 0), True, now)), 1)
 
     def test_shared_listeners(self) -> None:
-        """A bidder that sent its bid to the whole council gets an announcement only from the member that made it."""
+        """A bidder that sent its bid to the whole council gets an announcement only from its author."""
         recipients = Recipients()
         recipients.add(CONTACTS[5], is_shared=True)
         self.assertEqual(recipients.take_due_notices(announced(1, 1), False, 0.0), [])
@@ -167,7 +167,7 @@ class BidderTests(SynchronousTestCase):
         self.assertEqual([offer.to for offer in again], [COUNCIL[2]])
 
     def test_new_bid_while_the_old_one_is_under_way(self) -> None:
-        """A confirmation applies to the bid that was sent, not to a newer bid."""
+        """A confirmation applies only to the bid that was sent; a newer bid of the agent remains unconfirmed."""
         self.participant.make_bid(bid(5, 2.0), DIRECT, 0.0)
         sent = offers(self.participant.take_due_messages(0.0))
         self.participant.make_bid(bid(5, 1.0, 1), DIRECT, 0.01)
@@ -254,7 +254,7 @@ class TreeNodeTests(SynchronousTestCase):
         self.assertEqual(up.to, find_hops(AUCTION, CONTACTS[5].node_id, CONTACTS)[0])
 
     def test_nearer_ones_wait_longer(self) -> None:
-        """Nodes nearer to the key wait longer for bids of their children, up to half the waiting period."""
+        """A node that is nearer to the key waits longer for bids of its children, up to half the waiting period."""
         waits = []
         for contact in sorted(CONTACTS[3:], key=lambda c: count_shared_bits(c.node_id, AUCTION.key)):
             one = make_participant(CONTACTS.index(contact))
@@ -277,7 +277,7 @@ class TreeNodeTests(SynchronousTestCase):
         self.assertEqual(asked, expected)
 
     def test_confirmed_is_not_sent_again(self) -> None:
-        """Only bids that the parent does not have are forwarded; a child's duplicate bid causes no message."""
+        """A node forwards only bids that its parent does not have; a child's duplicate bid causes no message."""
         self.participant.on_offer([bid(6, 1.0)], CONTACTS[6], 0.0, False, 0.0)
         [up] = offers(self.participant.take_due_messages(self.participant.due))
         self.participant.on_answer(up, 0.2)
@@ -321,7 +321,7 @@ class AnnouncerTests(SynchronousTestCase):
     def take(
         self, member: Participant, place: int, cost: float | None, now: float, revision: int = 0, shared: bool = True
     ) -> None:
-        """Let a council member receive the bid of the agent at ``place``."""
+        """Let a council member receive the bid of the agent with index ``place``."""
         member.on_offer([bid(place, cost, revision)], CONTACTS[place], 0.0, shared, now)
 
     def test_closes_after_the_waiting_period(self) -> None:
@@ -343,7 +343,7 @@ class AnnouncerTests(SynchronousTestCase):
         self.assertEqual(len(notices(self.first.take_due_messages(0.1))), 4)
 
     def test_next_member_stands_in(self) -> None:
-        """If the first member is silent, the second member announces, except after an announcement of the first."""
+        """If the first member is silent and has not announced, the second member announces."""
         self.take(self.second, 5, 2.0, 0.0)
         self.second.take_due_messages(0.6)
         self.assertIsNone(self.second.announcement)

@@ -45,7 +45,7 @@ class ReportersTests(SynchronousTestCase):
         self.assertEqual(self.reporters.compute_due(replace(ME, why="waits"), 0.1), 0.1)
 
     def test_turn_comes_while_there_are_few(self) -> None:
-        """In a larger group, an agent without a decision writes at its turn, unless enough others have written."""
+        """In a larger group an agent that is not chosen writes at its turn, unless enough others have written."""
         self.reporters.on_records(OTHERS, MAX_SMALL_TEAM + 1, 0.0)
         self.assertEqual((self.reporters.is_partial(0.0), self.reporters.compute_due(ME, 0.0)), (True, math.inf))
         reporters = Reporters("me", 0.5)
@@ -62,7 +62,7 @@ class ReportersTests(SynchronousTestCase):
         self.assertAlmostEqual(self.reporters.compute_due(ME, 10.0), 10.0 + self.turn)
 
     def test_small_group_of_a_large_team(self) -> None:
-        """If few records exist after all turns, the group is small, and each agent writes immediately."""
+        """If only few records exist after all turns, the group counts as small, and each agent writes immediately."""
         over = LISTENING_S + MANY * TURN_SPACING_S + SETTLING_S
         self.assertEqual([self.reporters.is_partial(over - 0.01), self.reporters.is_partial(over)], [True, False])
         self.assertEqual(self.reporters.compute_due(ME, over), over)

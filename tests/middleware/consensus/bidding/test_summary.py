@@ -1,4 +1,4 @@
-"""Tests of the summary of bids, including joins of two summaries and strategies that misbehave."""
+"""Tests of the summary of bids, with joins of two summaries, and with strategies that misbehave."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class SummaryTests(SynchronousTestCase):
         self.assertEqual(len(self.summary.list_bids()), MAX_LEADING_REPORTS)
 
     def test_change_is_told(self) -> None:
-        """A join returns whether it changed the summary; a duplicate bid changes nothing."""
+        """``join`` returns whether the bids changed the summary; a duplicate bid changes nothing."""
         self.assertTrue(self.summary.join([bid(3, 1.0)]))
         self.assertFalse(self.summary.join([bid(3, 1.0)]))
         self.assertFalse(self.summary.join([]))
@@ -64,8 +64,8 @@ class SummaryTests(SynchronousTestCase):
         dice.shuffle(again)
         for one in again:
             mixed.join(one)
-        # A bid that was displaced returns after the withdrawal of a better bid, so join each batch again before the
-        # comparison.
+        # A displaced bid counts again only when it is joined after a better bid was withdrawn. So both summaries join
+        # each batch again before the comparison.
         for one in batch:
             straight.join(one)
             mixed.join(one)

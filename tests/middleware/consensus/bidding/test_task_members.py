@@ -66,7 +66,10 @@ class TaskMembersTests(SynchronousTestCase):
         self.assertEqual(self.task_members.list_awaited(), [])
 
     def test_announced_before_the_record(self) -> None:
-        """A bid announced before the agent's record arrives counts when it arrives, until the record changes."""
+        """If a bid is announced before the agent's record arrives, the bid counts as soon as the record has arrived.
+
+        A later change of the record overrides the bid.
+        """
         self.task_members.update_announced([Report("c", 0.5)])
         self.assertEqual(self.task_members.list_awaited(), [Report("c", 0.5)])
         here = [member("a", 3.0), member("b", None)]
@@ -103,7 +106,7 @@ class GroupTests(FleetCase):
         return groups
 
     def hearing(self, place: int) -> OnMembers:
-        """Return a callback that stores the members reported to the node at ``place``."""
+        """Return a callback that stores the members that are reported to the node with index ``place``."""
 
         def heard(members: list[Member], outcome: Result | None) -> None:
             self.heard[place].append(costs(members))
@@ -135,7 +138,7 @@ class GroupTests(FleetCase):
             self.assertEqual(self.heard[place][-1], {uuids[0]: None, uuids[1]: 2.0, uuids[2]: 3.0})
 
     def test_who_leaves_is_not_heard_of(self) -> None:
-        """When a member leaves, the others remove it, and it receives nothing more."""
+        """When a member leaves, the other members remove it, and it gets no further reports."""
         fleet = self.swarm(4)
         groups = self.groups(fleet)
         for place, group in enumerate(groups):

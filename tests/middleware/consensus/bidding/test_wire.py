@@ -97,7 +97,7 @@ class BidTests(SynchronousTestCase):
 
 class AnnouncementTests(SynchronousTestCase):
     def test_only_of_the_council(self) -> None:
-        """An announcement signed by a node outside the council is not genuine, whatever rank it states."""
+        """If a node outside the council signed an announcement, it is not genuine, whatever rank it contains."""
         stranger = AGENTS[7]
         one = announced(1, 0, bid(4, 1.5))
         for rank in (0, 1, 2, 3, 99):
@@ -118,6 +118,6 @@ class AnnouncementTests(SynchronousTestCase):
         self.assertIsNone(parse_announcement(sent(one.pack())))
 
     def test_precedence(self) -> None:
-        """The higher number has precedence; for equal numbers, the lower rank of the member has precedence."""
+        """The announcement with the higher number has precedence, or the lower rank if the numbers are equal."""
         first, second, third = announced(1, 0), announced(1, 2), announced(2, 2)
         self.assertEqual(sorted([first, third, second], key=lambda a: a.precedence), [second, first, third])

@@ -20,7 +20,7 @@ T = "t0"
 class LeaseCase(SynchronousTestCase):
     """A test case with agents and council members.
 
-    A new member grants nothing for one TTL, so ``made`` waits for one TTL.
+    A new council member grants nothing for one TTL, so ``made`` waits for one TTL.
     """
 
     def setUp(self) -> None:
@@ -60,11 +60,11 @@ class LeaseCase(SynchronousTestCase):
         return client
 
     def holders(self) -> list[int]:
-        """Return the agents that hold the lease by their own clocks."""
+        """Return the agents that hold the lease according to their own clocks."""
         return [place for place in self.room.agents if self.client(place).lease is not None]
 
     def cut(self, place: int, *others: int) -> None:
-        """Block the links between ``place`` and ``others``."""
+        """Block the links between the node with index ``place`` and ``others``."""
         self.room.radio.cut |= {pair for other in others for pair in ((place, other), (other, place))}
 
     def token(self, place: int) -> int:

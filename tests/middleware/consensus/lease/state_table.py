@@ -53,7 +53,7 @@ def _list(states: list[State]) -> str:
 
 
 def main() -> None:
-    """Replace the states between the markers of the page."""
+    """Replace the text between the markers of the page by the current states."""
     text = PAGE.read_text(encoding="utf-8")
     before, rest = text.split(BEGIN, 1)
     PAGE.write_text(before + write_states() + rest.split(END, 1)[1], encoding="utf-8")

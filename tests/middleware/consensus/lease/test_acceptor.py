@@ -35,7 +35,7 @@ class AcceptorTests(SynchronousTestCase):
         return self.acceptor.lease("t", configuration, ballot(number, agent), token, TTL, now)
 
     def test_promise_for_the_time_after_a_lease(self) -> None:
-        """Near the end of a lease another proposer gets a promise for the time after it, but no earlier grant."""
+        """Near the end of a lease another proposer gets a promise for the time after this end, but no grant."""
         self.prepare(1, "a", 0.0)
         self.propose(1, "a", 1, 0.0)
         self.assertEqual(self.prepare(2, "b", 1.5).kind, ReplyKind.HELD)
@@ -94,7 +94,7 @@ class AcceptorTests(SynchronousTestCase):
         self.assertEqual(self.propose(2, "b", 2, 1.2).kind, ReplyKind.GRANTED)
 
     def test_change_by_the_holder(self) -> None:
-        """A holder that changes the council keeps others away for one TTL, also at members of the next council."""
+        """If a holder changes the council, no member of the old or the next council grants to others for one TTL."""
         self.prepare(1, "a", 0.0)
         self.propose(1, "a", 1, 0.0)
         self.prepare(2, "a", 0.1)
@@ -111,7 +111,7 @@ class AcceptorTests(SynchronousTestCase):
         self.assertEqual(self.acceptor.prepare("t", 2, ballot(5, "b"), TTL, 0.3 + TTL).kind, ReplyKind.GRANTED)
 
     def test_release_that_overtakes_its_proposal(self) -> None:
-        """If a release arrives before its proposal, the proposal is not granted."""
+        """If the release of a ballot arrives before the proposal with this ballot, the proposal is not granted."""
         self.prepare(1, "a", 0.0)
         self.acceptor.release_by_ballot("t", ballot(1, "a"), 0.1)
         self.assertEqual(self.propose(1, "a", 1, 0.2).kind, ReplyKind.OUTBID)
@@ -132,7 +132,7 @@ class AcceptorTests(SynchronousTestCase):
             self.assertEqual(self.prepare(3, "b", 0.6)[:4:3], (ReplyKind.GRANTED, 0.0))
 
     def test_freed(self) -> None:
-        """A notice from another member that a lease was released is accepted only with the holder and its token."""
+        """Another member's notice of a release is accepted only if it names the holder and the token of the lease."""
         self.prepare(1, "a", 0.0)
         self.propose(1, "a", 1, 0.0)
         for agent, token in (("b", 1), ("a", 0), ("a", 2)):
@@ -233,7 +233,7 @@ class AcceptorTests(SynchronousTestCase):
         self.assertEqual(self.prepare(1, "b", 51.0).kind, ReplyKind.QUIET)
 
     def test_forgotten(self) -> None:
-        """An evicted task leaves a lower bound for later ballots and tokens, also after a restart."""
+        """After a task was evicted, a lower bound for later ballots and tokens remains, also after a restart."""
         self.patch(acceptor_log, "MAX_REGISTERS", 1)
         store = MemoryStore()
         self.acceptor = LeaseAcceptor(store, -math.inf)

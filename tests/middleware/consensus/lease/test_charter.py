@@ -115,7 +115,7 @@ class CharterTests(LeaseCase):
         self.assertIsNone(self.room.charter_verifier.parse(T, content))
 
     def test_signatures_are_apart(self) -> None:
-        """A signature of a council change is not valid for the end of a task, and the reverse."""
+        """A signature of a council change is not valid for the end of a task, nor the reverse."""
         members = tuple(self.room.contacts[:3])
         identity = self.room.identities[3]
         self.assertNotEqual(sign_change(identity, T, 1, Ballot(7, "a"), members, 7), sign_end(identity, T, 1, "a", 7))

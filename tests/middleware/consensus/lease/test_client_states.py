@@ -90,9 +90,9 @@ class ClientStatesTests(SynchronousTestCase):
                 self.assertEqual(next_step(State.OVER, event).state, State.OVER)
 
     def test_nothing_is_asked_in_vain(self) -> None:
-        """A transition to a state with a round sends the request of the round.
+        """Each transition to a state that waits for replies sends the request for them.
 
-        A transition to a state with a timer starts the timer, except for the event MOVE.
+        Each transition to a state with a timer starts this timer, unless the event is MOVE.
         """
         for state, row in TABLE.items():
             for event, (target, actions) in row.items():
@@ -103,7 +103,7 @@ class ClientStatesTests(SynchronousTestCase):
                     self.assertTrue(TIMERS & set(actions), (state, event))
 
     def test_a_client_goes_on(self) -> None:
-        """From each active state some path leads to the state HOLDING."""
+        """From each active state at least one path leads to the state HOLDING."""
         for begin in ACTIVE:
             found: set[State] = {begin}
             left: list[State] = [begin]

@@ -92,7 +92,7 @@ class LeaseClientTests(LeaseCase):
         self.assertEqual(self.holders(), [1])
 
     def test_second_in_line_lets_the_first_try(self) -> None:
-        """Of two standbys that find the lease free at the same time, the standby with the first rank gets it."""
+        """Of two standbys that find the lease free at the same time, the standby with the first rank gets the lease."""
         for seed in range(5):
             self.room = self.made(seed=f"free {seed}")
             for place, rank in ((2, 2), (1, 1)):
@@ -125,7 +125,7 @@ class LeaseClientTests(LeaseCase):
             self.assertEqual(self.room.nodes[place].acceptor.log.get(T).holder, first)  # type: ignore[union-attr]
 
     def test_stand_by_that_is_named(self) -> None:
-        """A standby that then claims the lease gets it; a holder that gets a rank as standby keeps its lease."""
+        """A client with a rank as standby can claim a free lease; a holder that gets such a rank keeps its lease."""
         self.client(0).stand_by(3)
         self.client(0).claim()
         self.run_for(2 * TTL)
@@ -156,7 +156,7 @@ class LeaseClientTests(LeaseCase):
         self.assertEqual(self.holders(), [0])
 
     def test_claim_that_is_dropped_holds_nobody_up(self) -> None:
-        """A claim that its client cancels is released at all members, whatever they have granted by then."""
+        """If a client cancels its claim, all members release it, even if some of them have granted it."""
         for steps in range(1, 12):
             self.room = self.made(seed=f"dropped {steps}")
             self.wanting(0, 0.001 * steps)

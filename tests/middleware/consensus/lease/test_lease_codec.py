@@ -33,7 +33,7 @@ ANYTHING = st.recursive(
 
 class BallotTests(SynchronousTestCase):
     def test_lives(self) -> None:
-        """Ballots of one process of an agent belong together; ballots of other agents, or after a restart, do not."""
+        """Two ballots have the same owner only if they are from the same agent, without a restart in between."""
         one = Ballot(3 * BALLOT_MODULUS + 7, "a")
         self.assertTrue(one.is_same_life(Ballot(9 * BALLOT_MODULUS + 7, "a"), BALLOT_MODULUS))
         self.assertFalse(one.is_same_life(Ballot(3 * BALLOT_MODULUS + 7, "b"), BALLOT_MODULUS))
@@ -93,7 +93,7 @@ class ReplyTests(SynchronousTestCase):
 
 
 class NoteTests(SynchronousTestCase):
-    """Tests of stored entries in the formats of earlier versions."""
+    """Tests of reading entries that earlier versions of the program stored."""
 
     def test_old_notes(self) -> None:
         """Promises, leases, accepted values and closes are read from rows with and without proof and grantee."""

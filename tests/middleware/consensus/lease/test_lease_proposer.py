@@ -33,7 +33,7 @@ class LeaseProposerTests(LeaseCase):
         self.assertEqual(self.token(1), 2)
 
     def test_who_knows_the_old_council_is_told(self) -> None:
-        """Any member, even a former member, redirects a client that has an old council record."""
+        """A client that only knows the old council is redirected by any member, even by a former one."""
         self.assertIsNone(self.change(1, 0, 1, 2))
         self.assertEqual(self.places(2), [0, 1, 2])
         self.room.charters[T] = replace(self.room.charters[T], changes=())
@@ -43,7 +43,7 @@ class LeaseProposerTests(LeaseCase):
         self.assertEqual((self.places(0), self.holders()), ([0, 1, 2], [0]))
 
     def test_member_that_was_away_is_told(self) -> None:
-        """A new member that was unreachable during the change learns of the change from the next claiming client."""
+        """If a new council member was unreachable during the change, the next client that claims informs it."""
         self.cut(6, *range(6))
         self.assertIsNone(self.change(1, 3, 4, 6))
         self.room.radio.cut.clear()

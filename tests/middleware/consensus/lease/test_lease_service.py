@@ -143,7 +143,7 @@ class InTimeTests(SynchronousTestCase):
         return Reply(ReplyKind.HELD, remaining=left) if left > 0.0 else Reply(ReplyKind.GRANTED)
 
     def test_answers_when_the_lease_ends(self) -> None:
-        """A proposal shortly before the end of a lease waits for this end and is granted, instead of rejected."""
+        """A proposal shortly before the end of a lease is not rejected, but waits for this end and is granted."""
         self.clock.advance(1.0 - MAX_WAIT_S + 0.01)
         answer = propose_when_free(self.proposed, self.clock)
         self.clock.advance(MAX_WAIT_S - 0.02)
@@ -160,7 +160,7 @@ class InTimeTests(SynchronousTestCase):
         self.assertEqual(self.successResultOf(answer).kind, ReplyKind.HELD)
 
     def test_answers_at_once(self) -> None:
-        """Any other reply is returned immediately."""
+        """A reply is returned immediately unless a lease ends soon."""
         for reply in (
             Reply(ReplyKind.GRANTED),
             Reply(ReplyKind.OUTBID),

@@ -41,7 +41,7 @@ class PinnedTests(FleetCase):
 
 class RuleTests(LeaseCase):
     def test_rule_2_council_changes_by_a_majority_of_the_old_one(self) -> None:
-        """A majority of the old council decides a change, never during an open claim.
+        """A majority of the old council decides a change, but never while a claim is open.
 
         The new council has the next configuration number.
         """
@@ -77,7 +77,7 @@ class RuleTests(LeaseCase):
         self.assertLessEqual(max(sent), TTL)
 
     def test_rule_4_token_outlives_restarts(self) -> None:
-        """Each lease has a higher token than all earlier leases, although every member is restarted in between."""
+        """Each lease has a higher token than all earlier leases, even if every member restarts between two leases."""
         tokens = []
         for place in (0, 1, 2, 0):
             self.wanting(place)
@@ -203,7 +203,10 @@ class RuleTests(LeaseCase):
         self.assertEqual((gate.is_motion_over(4.9), gate.is_motion_over(5.0)), (False, True))
 
     def test_rule_9_the_end_carries_the_token(self) -> None:
-        """A former holder cannot close the task under its old token; of two results the higher token wins."""
+        """A former holder cannot close the task under its old token.
+
+        Of two results, the one with the higher token wins.
+        """
         self.wanting(0)
         self.client(0).release()
         self.wanting(1)
@@ -236,7 +239,7 @@ class RuleTests(LeaseCase):
             self.assertEqual(self.room.recorder.violations, [])
 
     def test_rule_11_suspicion_shortens_no_lease(self) -> None:
-        """If a standby suspects the holder, the lease does not end earlier; the standby is ready when it ends."""
+        """A standby that suspects the holder does not shorten the lease, but is ready when the lease ends."""
         self.wanting(0)
         self.client(1).stand_by()
         for _ in range(40):

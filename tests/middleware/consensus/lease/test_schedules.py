@@ -28,7 +28,7 @@ class ScheduleTests(SynchronousTestCase):
         self.assertNotEqual(digests[0], digests[2])
 
     def test_bugs_show(self) -> None:
-        """The schedules find seeded bugs of safety, of liveness and of the device within a few runs."""
+        """Within a few runs the schedules find each seeded bug (of safety, of liveness, or of the device)."""
         for bug in (
             "a clock that stands still while suspended",
             "the council is whoever is closest now",
