@@ -40,7 +40,10 @@ class WorldTests(SynchronousTestCase):
         self.assertAlmostEqual(self.dog.y, 1.0, 6)
 
     def test_moves_in_its_own_frame(self) -> None:
-        """Velocities are relative to the dog: if it faces up, left is smaller x; turns are counter-clockwise."""
+        """Velocities are relative to the dog: if it faces up, a step to the left decreases x.
+
+        Turns are counter-clockwise.
+        """
         self.world.move_dog("dog1", 1.4, 1.0, math.pi / 2)
         self.world.drive("dog1", 0.0, 0.1, 0.0)
         run(self.world, 1.0)

@@ -199,9 +199,9 @@ class AdmissionTests(SynchronousTestCase):
         self.assertEqual((seeds[0], len(set(seeds))), (seeds[1], 2))
 
     def test_bad_codes_are_named(self) -> None:
-        """A mistyped code is rejected before a request is sent, a used code by the bootstrap node.
+        """A mistyped code is rejected before a request is sent; a used code is rejected by the bootstrap node.
 
-        Both with a remedy.
+        Both errors contain a remedy.
         """
         found = self.done(invite.main, "dog9")
         wrong = found["code"][:-1] + ("0" if found["code"][-1] != "0" else "1")

@@ -62,7 +62,7 @@ class TeamFallbacksTests(FleetCase):
         return swarm, webs
 
     def test_know_each_other(self) -> None:
-        """Each web node lists its own page first, then the page of the other, and accepts requests from that page."""
+        """Each web node lists its own page first, then the page of the other node, from which it accepts requests."""
         _, (first, second) = self.web_nodes()
         self.assertEqual([page.url for page in first.list_pages()], ["http://127.0.0.1:8080", "http://127.0.0.1:8081"])
         self.assertEqual([page.is_self for page in second.list_pages()], [True, False])

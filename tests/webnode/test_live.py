@@ -72,7 +72,10 @@ class EventStreamsTests(SynchronousTestCase):
         return Connection(self.site).ask(f"/events{query}", **headers)
 
     def test_start_with_everything(self) -> None:
-        """A new page receives state, map, pages and beat immediately, in a stream that is not cached."""
+        """A new page immediately receives the state, the map, the list of web pages and the first beat.
+
+        The response is not cached.
+        """
         data = self.connected().taken()
         self.assertIn(b"text/event-stream", data)
         self.assertIn(b"no-store", data)

@@ -225,7 +225,7 @@ class FactoryTests(SynchronousTestCase):
         return make_sessions(settings, cast(Any, node), None, random.Random(1), cast(Any, team))
 
     def test_have_the_code_of_the_settings(self) -> None:
-        """The code is that in the settings, or else a random code without ambiguous letters."""
+        """The access code is set in the settings; otherwise it is random and contains no ambiguous letters."""
         self.assertEqual(self.made(code="quiet-otter").code, "quiet-otter")
         self.assertRegex(self.made().code, r"^[a-hj-km-np-z]{4}-[a-hj-km-np-z]{4}$")
         self.assertNotEqual(draw_code(random.Random(1)), draw_code(random.Random(2)))

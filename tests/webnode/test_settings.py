@@ -115,7 +115,7 @@ class TunerTests(SynchronousTestCase):
         self.assertEqual(self.told(), before)
 
     def test_device_that_is_gone_is_told(self) -> None:
-        """Reading the settings of a device that has just failed gives status 409."""
+        """If a device has just failed, reading its settings gives status 409."""
         self.team.kill("dog1")
         asked = read_settings(self.team.control, self.node.uuid)
         self.team.clock.advance(2.0)

@@ -92,7 +92,7 @@ class CatalogueTests(SynchronousTestCase):
         self.assertTrue(all(entry.is_ready for entry in list_kind_entries(lambda library: True)))
 
     def test_names_the_broken_kinds_of_others(self) -> None:
-        """A driver of another distribution is listed with its docstring; a driver that cannot be imported is broken."""
+        """A driver of another distribution is listed with its docstring, or as broken if it cannot be imported."""
         folder = Path(self.mktemp()).resolve()
         (folder / "odd-1.dist-info").mkdir(parents=True)
         (folder / "odd-1.dist-info" / "METADATA").write_text("Name: odd\nVersion: 1\n")
