@@ -183,7 +183,7 @@ class GatewayTests(SynchronousTestCase):
     def test_comes_back_while_it_leaves(self) -> None:
         """A phone that joins again while it is releasing its task waits until the release is done.
 
-        It is listed once.
+        The phone is listed only once.
         """
         phone = Phone(self, self.gateways["vaio"])
         self.sees = {"target.bearing": 0.0, "target.distance": 0.05}

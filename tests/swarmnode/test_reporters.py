@@ -1,4 +1,4 @@
-"""Tests of a task with many bidders: real nodes and agents, of which only the reporters write records."""
+"""Tests of a task with many bidders, in which only some agents, the reporters, write records."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ STEP = 0.05
 
 
 class Stand:
-    """A behaviour with a random cost that never finishes."""
+    """A behaviour that has a random cost and never finishes."""
 
     def __init__(self, parameters: Mapping[str, float | str], rng: random.Random) -> None:
         self.cost = round(1.0 + rng.random(), 3)

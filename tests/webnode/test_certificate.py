@@ -108,7 +108,7 @@ class LeafTests(SynchronousTestCase):
         self.assertEqual(self.flaw(names=["::ffff:192.168.0.7", "VAIO.local.", "127.0.0.1", "localhost"]), "")
 
     def test_tell_a_foreign_one(self) -> None:
-        """A certificate of a different authority, and a private key that does not match the certificate, are rejected."""
+        """A certificate of a different authority is rejected, and so is a private key that does not match."""
         self.assertIn("another authority", self.leaf.find_flaw(make_authority(bytes(32), "vaio"), self.names, NOW))
         other = make_leaf(self.signer, "vaio", self.names, NOW, random.Random(2))
         self.assertIn("key", Leaf(other.key, self.leaf.certificate).find_flaw(self.signer, self.names, NOW))

@@ -90,7 +90,10 @@ class TeamFallbacksTests(FleetCase):
         self.assertFalse(second.can_authenticate(keys[0]))
 
     def test_let_in_the_page_of_the_dead(self) -> None:
-        """A failed web node is not listed, but for an hour requests from its page in a browser are accepted."""
+        """A failed web node is not listed.
+
+        Its page can still be open in a browser, so requests from that page are accepted for an hour.
+        """
         swarm, (first, second) = self.web_nodes()
         swarm.nodes[0].stop_silently()
         swarm.run(3)

@@ -151,7 +151,10 @@ class SignedSessionsTests(SynchronousTestCase):
         self.assertEqual(self.refused("correct hors").status, 401)
 
     def test_check_two_passwords_at_once(self) -> None:
-        """Two passwords are checked at a time, some wait, and the rest get status 503; each counts as an attempt."""
+        """Two passwords are checked simultaneously, some wait, and all further ones get status 503.
+
+        Each of them counts as an attempt.
+        """
         asked: list[Deferred[bool]] = []
 
         def check(text: str, word: str) -> Deferred[bool]:

@@ -155,7 +155,7 @@ class DepartedDevicesTests(SynchronousTestCase):
         self.assertEqual(departed.update(both[1:], 161.0), [])
 
     def test_forget_when_back(self) -> None:
-        """A device that returns is present immediately; if it is lost again, the time of loss is new."""
+        """A device that returns is listed as present immediately; a second loss gets a new time of loss."""
         departed = DepartedDevices()
         departed.update([device(1)], 1.0)
         self.assertEqual(len(departed.update([], 2.0)), 1)

@@ -278,7 +278,7 @@ class HandshakeTests(SynchronousTestCase):
         return b""
 
     def test_let_little_wait_for_a_slow_reader(self) -> None:
-        """With TLS the send buffers are as small as without TLS: the option is set on the socket below TLS."""
+        """With TLS the send buffers are as small as without TLS, because the option is set on the socket below TLS."""
         connection = self.connected()
         with socket.socket() as below:
             connection.transport.getHandle = lambda: below  # type: ignore[attr-defined]

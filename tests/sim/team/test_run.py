@@ -157,7 +157,7 @@ class RunTests(SynchronousTestCase):
         self.assertEqual(born, [(at + 3.0, place) for at, place in killed])
 
     def test_healing_brings_all_back(self) -> None:
-        """Every fault ends before the repair: no node is cut off, frozen or down, and no disk is full."""
+        """All faults end before the repair starts: no node is then cut off, frozen or down, and no disk is full."""
         faults = tuple(
             Fault(kind, 1.0, lasts=99.0, count=2, amount=1.1 if kind == "rate" else 0.0)
             for kind in ("crash", "leave", "freeze", "cut", "deaf", "mute", "clog", "rate", "full")
@@ -181,7 +181,7 @@ class RunTests(SynchronousTestCase):
         self.assertEqual(known, [9] * 10)
 
     def test_what_lasts_ends_at_its_time(self) -> None:
-        """A partition, more loss, a fast clock, a full disk and a frozen node last for the duration of the fault."""
+        """A partition, extra loss, a fast or wrong clock, a full disk and a frozen node end when the fault ends."""
         faults = tuple(
             Fault(kind, 2.0, lasts=3.0, places=(1,), amount=1.5 if kind == "rate" else -60.0 if kind == "step" else 0.0)
             for kind in ("cut", "freeze", "rate", "full", "step")

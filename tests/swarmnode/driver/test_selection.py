@@ -137,7 +137,7 @@ class RecordingConnectorTests(SynchronousTestCase):
             self.assertEqual(connector.connect(name, 10020, None), "tcp", name)
 
     def test_keeps_one_line_to_each_place(self) -> None:
-        """Repeated connections to the same robot do not use more and more memory."""
+        """Repeated connections to the same robot do not increase the memory use."""
         tcp = SimpleNamespace(connect=lambda host, port, client: SimpleNamespace(problem=client))
         connector = RecordingConnector(tcp, None)
         for number in range(1000):
