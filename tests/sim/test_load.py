@@ -31,7 +31,7 @@ def played(text: str, seed: int = 1) -> tuple[Outcome, dict[str, Metric]]:
 
 class NodeIdIndexTests(SynchronousTestCase):
     def test_closest(self) -> None:
-        """After random joins and ends of nodes, ``find_closest`` matches a search of all running nodes."""
+        """While nodes join and end at random, ``find_closest`` gives the same result as a search of all nodes."""
         rng, census, living = random.Random(1), NodeIdIndex(), set()
         for _ in range(300):
             born = rng.randbytes(20)

@@ -63,7 +63,10 @@ class SensorsTests(SynchronousTestCase):
         self.assertLess(self.mean_range("range.chest", 0.12), 0.15)
 
     def test_feels_gravity_and_its_own_start(self) -> None:
-        """At rest the accelerometer shows gravity, positive upwards; a start is positive in x, a stop is negative."""
+        """At rest the accelerometer measures gravity, positive upwards.
+
+        The value in x is positive when the dog starts to walk, and negative when it stops.
+        """
         rows = self.run_for(1.0)
         self.assertLess(abs(statistics.fmean(rows["imu.az"]) - 9.80665), 0.05)
         self.assertLess(abs(statistics.fmean(rows["imu.ax"])), 0.05)

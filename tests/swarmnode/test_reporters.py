@@ -94,9 +94,9 @@ class ReportersTests(SynchronousTestCase):
         return sorted(every, key=lambda name: (every[name].me.cost or 0.0, every[name].me.uuid))
 
     def test_best_acts_and_the_next_takes_over(self) -> None:
-        """The best agent acts with few records and datagrams, and all agents agree; later the next best takes over.
+        """The best agent acts and all agents agree, with few records and datagrams.
 
-        The takeover takes at most 3 s.
+        When the best agent vanishes, the next best agent takes over within 3 s.
         """
         name, _ = self.run_until_one_acts(5.0)
         self.assertEqual(name, self.ranked()[0])

@@ -95,7 +95,7 @@ class SignedSessionsTests(SynchronousTestCase):
         self.assertEqual(refusal.status, 401)
 
     def test_believe_gateways_alone(self) -> None:
-        """A session is invalid while one of its vouching nodes is not a gateway.
+        """A session is invalid while one of the nodes that vouched for it is not a gateway.
 
         Only gateways allow signing in.
         """
