@@ -38,7 +38,7 @@ if not MISSING:
 SKIP = f"TLS IS NOT TESTED: missing {', '.join(MISSING)} (pip install 'swarm-node[tls]')"
 NOW = 1.8e9
 NO_CHECK_TIME = 0x200000
-"""X509_V_FLAG_NO_CHECK_TIME of OpenSSL; needed because the certificate is valid at the test's time, not the real time."""
+"""X509_V_FLAG_NO_CHECK_TIME of OpenSSL, because the certificate is valid at the test's time, not at the real time."""
 DAY = 86400.0
 
 
