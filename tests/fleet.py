@@ -16,7 +16,7 @@ T = TypeVar("T")
 
 
 class FleetCase(SynchronousTestCase):
-    """A test with simulated nodes; no timer may be left at its end."""
+    """A test with simulated nodes; no timer may be left at the end of the test."""
 
     worlds: list[EntangledTeam | SwarmTeam]
 

@@ -1,4 +1,4 @@
-"""Run a program in several processes, and check that its output does not depend on the order of sets."""
+"""Run a program in several processes, and check that the program's output does not depend on the order of sets."""
 
 from __future__ import annotations
 

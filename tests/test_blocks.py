@@ -47,7 +47,7 @@ class Parsed(Exception):
 
 
 def find_blocks(*languages: str) -> Iterator[Block]:
-    """Yield the code blocks in these languages; all blocks without an argument."""
+    """Yield the code blocks in these languages, or all code blocks if no language is given."""
     for document in DOCUMENTS:
         text = document.read_text(encoding="utf-8")
         for match in FENCE.finditer(text):
@@ -117,7 +117,7 @@ def merge_tables(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[st
 
 
 def find_problems(block: Block, content: dict[str, Any]) -> list[str]:
-    """Return the problem of a TOML block for each kind of file that it may be, empty if it is a valid one."""
+    """Return, for each kind of file, the problem of a TOML block as such a file; it is empty if the block is valid."""
     named: dict[str, dict[str, Any]] = {"node": {"name": "dog1"}}
     readers: list[Callable[[], object]] = [
         lambda: Settings.from_mapping(merge_tables(named, content), "node.toml"),
@@ -151,7 +151,7 @@ class BlockTest(SynchronousTestCase):
         self.assertEqual(wrong, [])
 
     def test_commands_are_accepted(self) -> None:
-        """The parser of its command accepts each command line of the shell blocks."""
+        """Each command line in the shell blocks is accepted by the argument parser of its command."""
 
         def stop(parser: argparse.ArgumentParser, *words: Any, **options: Any) -> NoReturn:
             parse(parser, *words, **options)
@@ -184,6 +184,9 @@ class BlockTest(SynchronousTestCase):
                 self.assertIn("", problems, f"{block.place}: {problems}")
 
     def test_programs_compile(self) -> None:
-        """Each Python block is a program or a part of one; ``tests.live.test_examples`` runs the README's."""
+        """Each Python block is a program or a part of one.
+
+        ``tests.live.test_examples`` runs the program in the README.
+        """
         for block in find_blocks("python"):
             compile(textwrap.dedent(block.text), block.place, "exec", ast.PyCF_ALLOW_TOP_LEVEL_AWAIT)

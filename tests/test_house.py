@@ -247,12 +247,12 @@ class FloorPlanTests(SynchronousTestCase):
     """Imports only go to lower layers."""
 
     def test_imports_follow_the_floor_plan(self) -> None:
-        """No module imports a package that is above it, in another branch, or hidden behind an interface."""
+        """No module imports a package of a higher layer or a parallel branch, or one hidden behind an interface."""
         wrong = [f"{module} imports {name}" for module in FILES for name in _ours(module) if _crosses(module, name)]
         self.assertEqual(wrong, [])
 
     def test_every_layer_has_a_wall(self) -> None:
-        """For each package except the topmost, the test detects an import of a package above it."""
+        """For each package except the topmost, the check above detects an import of a package in a higher layer."""
         above = [
             ("middleware.entangled.wire", "middleware.entangled.kademlia.overlay"),
             ("middleware.entangled.space", "middleware.entangled.node"),
@@ -415,7 +415,7 @@ class PackagingTests(SynchronousTestCase):
         self.assertEqual(list((ROOT / "twisted").rglob("__init__.py")), [])
 
     def test_nobody_else_owns_our_names(self) -> None:
-        """No other installed distribution has a top-level package with the same name as ours: the files would mix."""
+        """No other installed distribution has a top-level package of the same name as ours; the files would mix."""
         owners = packages_distributions()
         foreign = {
             room: others

@@ -1,4 +1,4 @@
-"""Tests of the reference pages whose tables have columns from the code (``docs/generate.py``)."""
+"""Tests of the reference pages that contain tables with columns generated from the code (``docs/generate.py``)."""
 
 from __future__ import annotations
 

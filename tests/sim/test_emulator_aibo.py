@@ -120,7 +120,10 @@ class AiboEmulatorTests(SynchronousTestCase):
         self.assertIn(b"\n----------\n0\n\n2\n1\nMode Switch\n2\n", self.say(main, b"!refresh\n"))
 
     def test_starts_stopped_and_tells_changes_alone(self) -> None:
-        """The e-stop is on at first and sends nothing on connect; it reports changes, refreshes and button presses."""
+        """The e-stop is on at first, and sends nothing to a new client.
+
+        It reports its state after the command ``refresh``, after a change and after a press of the button.
+        """
         estop = self.called(ESTOP)
         self.assertEqual(estop.heard, b"")
         for said, answer in ((b"refresh\n", b"on\n"), (b"stop\n", b""), (b"start\n", b"off\n"), (b"warp\n", b"")):
@@ -130,9 +133,9 @@ class AiboEmulatorTests(SynchronousTestCase):
         self.assertEqual(estop.heard, b"on\n")
 
     def test_walks_while_its_motors_are_on(self) -> None:
-        """Each motion component stays in force until it changes.
+        """Each motion component stays in force until a command changes it.
 
-        A stopped dog ignores commands and restarts at rest.
+        A stopped dog ignores commands, and stands still when its motors are enabled again.
         """
         _, walk = self.released()
         self.say(walk, encode_command("f", 0.5) + encode_command("r", -0.25))
@@ -196,7 +199,10 @@ class AiboEmulatorTests(SynchronousTestCase):
         self.assertAlmostEqual(pan, 0.768, places=5)
 
     def test_sends_pictures_only_where_they_are_asked_for(self) -> None:
-        """Pictures are sent over TCP if configured, and over UDP after a request; they end with ``CloseConnection``."""
+        """Pictures are sent over TCP if this is configured, and over UDP after a request.
+
+        The command ``CloseConnection`` ends them.
+        """
         main = self.called(MAIN)
         heard = self.say(main, b'!select "Raw Cam Server"\n')
         self.assertIn(b'10011\n"raw" "10011" "udp"\n', heard)

@@ -31,7 +31,7 @@ def played(text: str, seed: int = 1) -> tuple[Outcome, dict[str, Metric]]:
 
 class NodeIdIndexTests(SynchronousTestCase):
     def test_closest(self) -> None:
-        """After random joins and ends of nodes, ``find_closest`` matches a search of all running nodes."""
+        """While nodes join and end at random, ``find_closest`` gives the same result as a search of all nodes."""
         rng, census, living = random.Random(1), NodeIdIndex(), set()
         for _ in range(300):
             born = rng.randbytes(20)
@@ -51,7 +51,7 @@ class NodeIdIndexTests(SynchronousTestCase):
 
 class PacerTests(SynchronousTestCase):
     def test_due(self) -> None:
-        """The number of due operations follows the rate, however often it is polled, up to the total number."""
+        """Operations become due at the given rate, up to the total number, whatever the interval of the polls."""
         clock = HeapClock()
         pace = Pacer(clock, 2.5, 12)
         due = [pace.take_due()]
@@ -79,7 +79,11 @@ class QuietTests(SynchronousTestCase):
     """In a run without faults the workloads find no violation and measure the expected values."""
 
     def check(self, text: str, bounds: Bounds, **counts: int) -> None:
-        """Run a scenario; check that it has no violation, and that each figure has its bounds and number of samples."""
+        """Run a scenario, and check that it has no violation.
+
+        Each figure in ``bounds`` must be within its bounds, and each figure in ``counts`` must have that number of
+        samples.
+        """
         outcome, figures = played(text)
         self.assertEqual(outcome.violations, [])
         for name, (low, high) in bounds.items():
@@ -177,7 +181,7 @@ class WrongTests(SynchronousTestCase):
         self.assertEqual(len([line for line in outcome.violations if line.startswith("D6")]), 20)
 
     def test_lost_values(self) -> None:
-        """A value that no node returns is a violation immediately; a lost value is a violation at the end."""
+        """A value that no node returns is lost: this is a violation, and ``values.lost`` misses its target."""
         get = EntangledNode.get
 
         def nothing(node: EntangledNode, key: bytes, concern: Any = "majority") -> Deferred[list[Record]]:

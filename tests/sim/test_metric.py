@@ -22,7 +22,7 @@ from sim.team.metric import (
 
 class MetricTests(SynchronousTestCase):
     def test_bounds(self) -> None:
-        """A bound is parsed from text and includes its limit; invalid text is rejected."""
+        """A bound is parsed from text; a value equal to its limit meets the bound, and invalid text is rejected."""
         self.assertEqual(parse_bound("<= 450"), Bound(450.0))
         self.assertTrue(parse_bound(">= 0.999").is_met(0.999))
         self.assertFalse(parse_bound(">= 0.999").is_met(0.9989))
@@ -38,7 +38,7 @@ class MetricTests(SynchronousTestCase):
         self.assertIsNone(Metric("x", None).holds)
 
     def test_percentiles(self) -> None:
-        """A percentile is the smallest of the values that covers the share."""
+        """A percentile is a measured value: the smallest one that the given share of the values does not exceed."""
         values = [float(n) for n in range(100, 0, -1)]
         self.assertEqual((percentile(values, 0.5), percentile(values, 0.99)), (50.0, 99.0))
         self.assertEqual([figure.value for figure in make_percentiles("x", values, "s")], [50.0, 99.0, 100.0])

@@ -52,7 +52,10 @@ class TheoryTests(SynchronousTestCase):
 
 class MeasurementFileTests(SynchronousTestCase):
     def test_resumed(self) -> None:
-        """A size that is in the file is not measured again; a file with different settings is not overwritten."""
+        """A team size that is already in the file is not measured again.
+
+        A file that was measured with different settings is not overwritten.
+        """
         out = self.mktemp()
         asked: list[int] = []
 
@@ -84,7 +87,7 @@ class MeasurementFileTests(SynchronousTestCase):
         self.assertEqual(list(json.loads(Path(out, "scale.json").read_text())["sizes"]), ["3"])
 
     def test_bad_input(self) -> None:
-        """An invalid size or file, or a folder that cannot be written, is rejected; the error contains its name."""
+        """An invalid size, option or file, and a folder that cannot be written, are rejected."""
         for text in ("", "many", "2", "3,1000000"):
             with self.assertRaisesRegex(BadSetting, "--nodes"):
                 run_scale(["--nodes", text, "--out", self.mktemp()], world())

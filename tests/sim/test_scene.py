@@ -53,9 +53,9 @@ class SceneTests(SynchronousTestCase):
             self.assertIn("two.json", str(self.assertRaises(SceneError, parse_scene, text, "two.json")))
 
     def test_names_the_wrong_key(self) -> None:
-        """The error for a missing or invalid field contains its key.
+        """The error for a missing or invalid field contains the key of the field.
 
-        So does the error for dogs that are in a wall, overlap or have equal names.
+        Dogs that are in a wall, overlap or have equal names are rejected with a description of the problem.
         """
         wrong = {"width": 0, "height": "2", "wall_height": None, "name": 7, "dogs": [], "target": 3}
         for key, value in wrong.items():

@@ -43,7 +43,10 @@ class SensorsTests(SynchronousTestCase):
         return statistics.fmean(row)
 
     def test_ranges_within_the_reach_of_each_ranger(self) -> None:
-        """Near covers 0.05 to 0.5 m, far 0.2 to 1.5 m. Shorter distances read as the minimum, longer ones as NaN."""
+        """The near ranger measures 0.05 to 0.5 m, the far ranger 0.2 to 1.5 m.
+
+        A shorter distance is reported as the minimum, a longer distance as NaN.
+        """
         for gap in (0.1, 0.3, 0.45):
             self.assertLess(abs(self.mean_range("range.near", gap) - gap), 0.003)
         self.assertAlmostEqual(self.mean_range("range.near", 0.02), 0.05, 3)
@@ -60,7 +63,10 @@ class SensorsTests(SynchronousTestCase):
         self.assertLess(self.mean_range("range.chest", 0.12), 0.15)
 
     def test_feels_gravity_and_its_own_start(self) -> None:
-        """At rest the accelerometer shows gravity, positive upwards; a start is positive in x, a stop is negative."""
+        """At rest the accelerometer measures gravity, positive upwards.
+
+        The value in x is positive when the dog starts to walk, and negative when it stops.
+        """
         rows = self.run_for(1.0)
         self.assertLess(abs(statistics.fmean(rows["imu.az"]) - 9.80665), 0.05)
         self.assertLess(abs(statistics.fmean(rows["imu.ax"])), 0.05)

@@ -154,7 +154,7 @@ class SimulatorTests(SynchronousTestCase):
         self.assertFalse(self.is_moving())
 
     def test_stops_the_dog_of_a_lost_driver(self) -> None:
-        """If the connection closes, the dog stops; a new driver can connect, and receives the last token."""
+        """If the connection closes, the dog stops; a new driver can connect, and receives the last token of the dog."""
         self.drive(token=9, ttl=5.0)
         self.ticks(5)
         self.client.close()
@@ -181,7 +181,10 @@ class SimulatorTests(SynchronousTestCase):
         self.assertLess(self.simulator.world.t, 2.0)
 
     def test_tells_what_the_gates_did(self) -> None:
-        """Lower tokens and expired commands have no effect; each gate counts its accepted and rejected commands."""
+        """Expired commands and commands with a lower token are rejected.
+
+        Both accepted and rejected commands are counted, for each dog.
+        """
         self.drive(token=7)
         self.drive(token=7)
         self.drive(token=6, vx=-0.1)

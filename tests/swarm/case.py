@@ -45,7 +45,7 @@ class TeamCase(SynchronousTestCase):
         return team.clock.seconds() - started_at
 
     def look(self, team: SimulatedTeam) -> None:
-        """Do nothing; ``until`` calls this hook after each step."""
+        """Do nothing; ``until`` calls this method after each step, and test cases can override it."""
 
     def task(self, team: SimulatedTeam) -> dict[str, Any]:
         """Return the newest task in the page's state."""

@@ -52,7 +52,7 @@ class AgreementTests(TeamCase):
         self.assertEqual({member.battery for member in self.members_seen.values()}, {1.0})
 
     def test_vote_reaches_who_acts(self) -> None:
-        """Of two options, the one with two votes of three dogs wins, and one of these two dogs acts on it.
+        """The option for which two of three dogs vote wins, and one of these two dogs acts.
 
         All explanations agree.
         """

@@ -49,7 +49,7 @@ class TaskTests(TeamCase):
         self.assertEqual(set(self.statuses(team).values()), {"IDLE"})
 
     def test_device_is_done_or_idle_until_its_next_task(self) -> None:
-        """After a task its dog is DONE and the others are IDLE, until all of them take part in the next task."""
+        """After a task the dog that finished it is DONE and the other dogs are IDLE, until all join the next task."""
         team = self.start_team()
         team.control.assign("turn-around")
         shown: list[dict[str, str]] = []
@@ -122,7 +122,7 @@ class TaskTests(TeamCase):
         self.until(team, lambda: self.task(team)["status"] == "COMPLETED")
 
     def test_deadline_fails_the_task_and_says_so(self) -> None:
-        """A task that misses its deadline fails once for all devices, and the page shows the reason."""
+        """A task that misses its deadline fails for all devices, and the page shows the reason."""
         team = self.start_team()
         task = Task("late", "find-target", "Late", created=team.clock.seconds(), deadline=4.0)
         self.submit(team, task)

@@ -64,9 +64,9 @@ class GroupTests(TeamCase):
         return explain_decisions(self.verdicts(team, name)).epochs[0]
 
     def test_each_dog_does_one(self) -> None:
-        """Three dogs do one of three tasks each, simultaneously and with the lowest total cost; all dogs agree.
+        """Each of three dogs does one of three tasks; the tasks are done simultaneously, with the lowest total cost.
 
-        All reports on the three tasks have the same digest.
+        All dogs agree, and all their reports on the three tasks have the same digest.
         """
         team = self.busy_team()
         self.until(team, lambda: len(self.began) == len(TASKS))
@@ -109,7 +109,7 @@ class GroupTests(TeamCase):
         self.assertEqual(self.twice, [])
 
     def test_operator_gives_a_group(self) -> None:
-        """Predefined tasks in one group are done simultaneously, one by each dog, and the page shows the group."""
+        """Predefined tasks in one group are done simultaneously by different dogs, and the page shows the group."""
         team = self.start_team(5)
         for _ in DOGS:
             team.control.assign("turn-around", group="yard")

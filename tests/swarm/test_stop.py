@@ -102,7 +102,7 @@ class StopTests(TeamCase):
     def test_who_cannot_be_told_reads_it(self) -> None:
         """An unreachable dog is reported as unreachable.
 
-        It stops as soon as it can communicate with the others again.
+        The dog stops as soon as it can communicate with the other devices again.
         """
         self.team.run_demo()
         self.team.clock.advance(1.0)
@@ -130,7 +130,10 @@ class StopTests(TeamCase):
         self.assertFalse(self.team.state()["halted"])
 
     def test_nobody_waits_for_who_is_silent(self) -> None:
-        """A silent device does not delay the stop of the others; the page does not show the team as stopped."""
+        """A silent device does not delay the stop of the other devices.
+
+        The page lists the silent device, and does not show the team as stopped.
+        """
         acting = self.until_executing()
         silent = "dog2" if acting == "dog1" else "dog1"
         self.team.block_datagrams(silent)

@@ -33,7 +33,8 @@ class TakeoverTests(TeamCase):
     def test_dog_and_page_at_once(self) -> None:
         """If the acting dog and the node that serves the page are lost simultaneously, another dog takes over.
 
-        With both seeds a council of three members would contain the two lost nodes.
+        The seeds are chosen so that both lost nodes would be in a council of three members, which would lose its
+        majority.
         """
         for seed in (6, 7):
             team = self.start_team(seed, others=("pi",))
@@ -89,7 +90,7 @@ class TakeoverObserverTests(SynchronousTestCase):
         self.assertEqual(judge.make_trial(), Trial("crash", 1, "dog1", "dog2", True, 3.0, 0, 0))
 
     def test_thaws_the_frozen_once(self) -> None:
-        """Only a frozen dog is thawed, and only once; the trial is not over before the thaw."""
+        """A trial thaws only a frozen dog, and only once; the trial does not end before the thaw."""
         judge = self.judge(Cause.FREEZE)
         self.assertFalse(judge.is_over(999.0))
         self.assertEqual([judge.take_thaw(now) for now in (102.9, 105.1, 105.2)], [False, True, False])

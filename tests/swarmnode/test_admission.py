@@ -64,7 +64,7 @@ class AdmissionTests(SynchronousTestCase):
         return json.loads(output)
 
     def knock(self, code: JoinCode, seed: bytes, wish: str, addresses: Sequence[Address], timeout: float) -> Membership:
-        """Send a join request as the verb does, but in the virtual time and network of the team."""
+        """Send the join request of ``swarm join`` in the virtual time and network of the team."""
         self.newcomers += 1
         network = self.team.switchboard.make_network("127.0.0.1", 9000 + self.newcomers)
         work = JoinClient(code, seed, network, self.team.clock, self.dice, wish).join(addresses, timeout)
@@ -99,7 +99,7 @@ class AdmissionTests(SynchronousTestCase):
     def test_init_with_options(self) -> None:
         """By default the first node listens on all interfaces.
 
-        ``--page`` enables the page, ``--member`` adds a member.
+        ``--page`` enables the node's page, and ``--member`` adds a member to the team.
         """
         words = ("yard", "--operator", str(self.folder / "yard"), "--folder", str(self.folder), "--first", "vaio")
         for twice in (("--member", "vaio"), ("--member", "dog1", "--member", "dog1=gateway")):
@@ -166,13 +166,13 @@ class AdmissionTests(SynchronousTestCase):
         self.assertEqual(self.joined(other, "more")["name"], "dog8")
 
     def test_place_of_a_member(self) -> None:
-        """The location of a member is a phrase if its address is a tunnel, a relay or unknown."""
+        """The location of a member is described in words if the address is unknown, or that of a tunnel or a relay."""
         places = {"10.0.0.7:8484": "10.0.0.7:8484", "": "no known address", "~wss-1fa56333f510:1": "by a tunnel"}
         for address, words in {**places, f"~{'ab' * 20}:1": "by a relay"}.items():
             self.assertEqual(members.format_location(address), words)
 
     def test_settings_that_were_there(self) -> None:
-        """Existing settings are kept and reported; settings that the verb created are not reported."""
+        """Existing settings are kept and reported; settings that ``swarm join`` created are not reported."""
         where = self.folder / "new"
         where.mkdir()
         (where / "swarm.toml").write_text('[node]\nname = "mine"\n')
@@ -199,9 +199,9 @@ class AdmissionTests(SynchronousTestCase):
         self.assertEqual((seeds[0], len(set(seeds))), (seeds[1], 2))
 
     def test_bad_codes_are_named(self) -> None:
-        """A mistyped code is rejected before a request is sent, a used code by the bootstrap node.
+        """A mistyped code is rejected before a request is sent; a used code is rejected by the bootstrap node.
 
-        Both with a remedy.
+        Both errors contain a remedy.
         """
         found = self.done(invite.main, "dog9")
         wrong = found["code"][:-1] + ("0" if found["code"][-1] != "0" else "1")

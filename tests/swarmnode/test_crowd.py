@@ -43,9 +43,9 @@ class CrowdTeamTests(SynchronousTestCase):
         self.assertLess(float(crowd.x[body] - target.x) ** 2 + float(crowd.y[body] - target.y) ** 2, 0.4**2)
 
     def test_seed_replays_it(self) -> None:
-        """Processes with different hash seeds exchange the same datagrams.
+        """With the same seed, processes with different hash seeds exchange the same datagrams.
 
-        A different seed gives a different digest.
+        A different seed of the simulation gives a different digest.
         """
         digest = replayed(self, RUN)
         other = run_search(self.made(2, 3), 2, 6.0, lambda: 0.0).digest

@@ -39,7 +39,7 @@ class ChaosTests(SynchronousTestCase):
         return self.shell.run(command, line.split())
 
     def test_one_fault(self) -> None:
-        """For a fault in the acting device, successor and takeover time are printed, and the exit code is 0."""
+        """After a fault in the acting device, its successor and the takeover time are printed; the exit code is 0."""
         self.team()
         self.virtual.control.assign("turn-around")
         code, output = self.chaos("executing radio --seconds 4")

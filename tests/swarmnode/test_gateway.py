@@ -183,7 +183,7 @@ class GatewayTests(SynchronousTestCase):
     def test_comes_back_while_it_leaves(self) -> None:
         """A phone that joins again while it is releasing its task waits until the release is done.
 
-        It is listed once.
+        The phone is listed only once.
         """
         phone = Phone(self, self.gateways["vaio"])
         self.sees = {"target.bearing": 0.0, "target.distance": 0.05}
@@ -232,7 +232,7 @@ class GatewayTests(SynchronousTestCase):
         self.assertTrue(self.successResultOf(gateway.join(b"x" * 32, "late", CAN)))
 
     def test_sent_away_stays_away(self) -> None:
-        """A phone that an operator disconnects cannot join again until the time is over."""
+        """A phone that an operator disconnects for some time cannot join again before the end of that time."""
         phone = Phone(self, self.gateways["vaio"])
         self.live(1.0)
         self.team.control.disconnect(phone.uuid, 3.0)

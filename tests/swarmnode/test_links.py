@@ -92,7 +92,7 @@ class TeamTests(SynchronousTestCase):
         self.dog = self.team.services["dog1"].assembly.node
 
     def tell(self, statement: bytes) -> None:
-        """Distribute a statement that the operator signed."""
+        """Distribute a statement that is signed by the operator."""
         assert self.laptop.team is not None
         self.laptop.later(0.0, lambda: Deferred.fromCoroutine(self.laptop.team.publish(statement)))  # type: ignore[union-attr]
         self.team.clock.advance(3.0)
@@ -131,7 +131,7 @@ class TeamTests(SynchronousTestCase):
         self.assertNotIn("dog1", [member["name"] for member in describe_team(self.laptop)["members"]])
 
     def test_refused_call(self) -> None:
-        """If a role does not allow a call, the called node reports the call."""
+        """If the caller's role does not allow a call, the called node reports the call."""
         asked = self.dog.entangled.call(self.laptop.entangled.contact, "device.message", "sit", changes=True)
         self.team.clock.advance(1.0)
         self.failureResultOf(asked, Refused)

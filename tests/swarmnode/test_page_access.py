@@ -19,7 +19,7 @@ OWN = PageAccess("vaio", "http://127.0.0.1:8080/", "quiet-otter", os.getpid())
 
 class PageAccessTests(SynchronousTestCase):
     def setUp(self) -> None:
-        # The note is next to a control socket, whose path must be short, so it is outside the test folder.
+        # The note is written to the folder of the control sockets, which this variable moves into the test folder.
         self.where = Path(self.mktemp())
         self.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": str(self.where)})
 

@@ -35,7 +35,10 @@ class PasswordCommandTests(SynchronousTestCase):
         self.assertNotIn("horse", out)
 
     def test_refuse_in_one_line(self) -> None:
-        """A short, mistyped, untypable or missing password gives one error line and exit code 1."""
+        """An invalid or missing password gives one error line and exit code 1.
+
+        It is invalid if it is short, begins with a space, or differs from its repetition.
+        """
         for answers, words in (
             (("short",), "5 characters"),
             (("correct horse", "correct hors"), "not the same"),

@@ -1,4 +1,4 @@
-"""Tests of a task with many bidders: real nodes and agents, of which only the reporters write records."""
+"""Tests of a task with many bidders, in which only some agents, the reporters, write records."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ STEP = 0.05
 
 
 class Stand:
-    """A behaviour with a random cost that never finishes."""
+    """A behaviour that has a random cost and never finishes."""
 
     def __init__(self, parameters: Mapping[str, float | str], rng: random.Random) -> None:
         self.cost = round(1.0 + rng.random(), 3)
@@ -94,9 +94,9 @@ class ReportersTests(SynchronousTestCase):
         return sorted(every, key=lambda name: (every[name].me.cost or 0.0, every[name].me.uuid))
 
     def test_best_acts_and_the_next_takes_over(self) -> None:
-        """The best agent acts with few records and datagrams, and all agents agree; later the next best takes over.
+        """The best agent acts and all agents agree, with few records and datagrams.
 
-        The takeover takes at most 3 s.
+        When the best agent vanishes, the next best agent takes over within 3 s.
         """
         name, _ = self.run_until_one_acts(5.0)
         self.assertEqual(name, self.ranked()[0])

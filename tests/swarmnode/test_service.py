@@ -91,6 +91,6 @@ class NodeServiceTests(SynchronousTestCase):
         self.assertEqual(self.seen(), 2)
 
     def test_port_in_use_flies_at_the_start(self) -> None:
-        """A node with a port in use does not start, and raises ``PortInUse``."""
+        """A node whose port is in use does not start, and raises ``PortInUse``."""
         third = self.team.service("c", 7001)
         self.assertRaises(PortInUse, third.startService)

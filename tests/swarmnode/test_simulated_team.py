@@ -18,9 +18,9 @@ print(team.switchboard.digest())
 
 class ReplayTests(SynchronousTestCase):
     def test_seed_replays_a_team_exactly(self) -> None:
-        """Processes with different hash seeds exchange the same datagrams.
+        """With the same seed, processes with different hash seeds exchange the same datagrams.
 
-        A different seed gives a different digest.
+        A different seed of the simulation gives a different digest.
         """
         digest = replayed(self, RUN)
         self.assertEqual(len(digest), 64)

@@ -20,7 +20,7 @@ from swarmnode.tunnels import add_tunnels, find_proxy
 
 class WiringTests(SynchronousTestCase):
     def wired(self, **node: object) -> tuple[Network, list[Any], MemoryReactorClock]:
-        """Return a node's network for these settings, its tunnel addresses, and its reactor."""
+        """Return the network of a node with these settings, the node's tunnel addresses, and its reactor."""
         settings = Settings.from_mapping({"node": {"name": "a", **node}}, "test").node
         board = Switchboard(HeapClock(), random.Random(1))
         reactor = MemoryReactorClock()
@@ -37,7 +37,7 @@ class WiringTests(SynchronousTestCase):
             self.assertEqual((addresses, reactor.tcpServers), ([], []))
 
     def test_known_nodes_may_be_dialled(self) -> None:
-        """A node has a virtual tunnel address for each known node, but does not connect to these addresses yet."""
+        """A node has a virtual tunnel address for each known node, but opens no connection at its start."""
         network, addresses, reactor = self.wired(known_nodes=["10.0.0.7:7000"])
         self.assertIsInstance(network, JointNetwork)
         self.assertEqual(addresses, [Url.parse("wss://10.0.0.7").address])

@@ -37,7 +37,7 @@ class WhyTests(SynchronousTestCase):
         self.fail(f"nobody was ever {status}")
 
     def test_takeover_is_explained(self) -> None:
-        """Both epochs are explained: the first agent, its successor, the agreement, the tokens and the reports."""
+        """The explanation covers the epochs of the first agent and of its successor: agreement, tokens and reports."""
         task = self.team.run_demo()
         first = self.until("EXECUTING")
         self.team.clock.advance(1.5)

@@ -51,7 +51,7 @@ class MemoryDiagnostics(Diagnostics):
 class MemoryStopControl(StopControl):
     """The emergency stop of a team that always obeys.
 
-    ``devices`` are the uuids of the devices, ``said`` the requests.
+    ``devices`` contains the uuids of the devices, ``said`` the received requests.
     """
 
     def __init__(self, *devices: str) -> None:

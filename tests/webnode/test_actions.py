@@ -40,7 +40,10 @@ class ActionTests(SynchronousTestCase):
         return answer.status_code, answer.get_json()
 
     def test_stop_and_go_on(self) -> None:
-        """Stop and release return the state of each device and are audited; viewers can read the state of the stop."""
+        """Requests to stop and release return the state of each device, and are written to the audit log.
+
+        Viewers can read the state of the stop.
+        """
         stopped = (200, {"halted": True, "devices": {"01": "stands", "02": "stands"}})
         self.assertEqual(self.ask("POST", "halt", {}), stopped)
         self.assertEqual(self.ask("GET", "halt", role="viewer"), (200, {"halted": True}))

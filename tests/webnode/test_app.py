@@ -173,9 +173,9 @@ class AppTests(SynchronousTestCase):
         self.assertEqual((bad.status_code, bad.get_json()["error"]["field"]), (400, "Idempotency-Key"))
 
     def test_share_with_the_team(self) -> None:
-        """Pages of the team's other web nodes may read and send requests, also after a CORS preflight.
+        """A page of another web node of the team may read and send requests, also after a CORS preflight.
 
-        Other pages may not.
+        A page of any other origin may not.
         """
         other, evil = {"Origin": "http://other:8080"}, {"Origin": "http://evil:8080"}
         for headers, told in ((other, "http://other:8080"), (evil, None)):

@@ -89,7 +89,7 @@ class AuditTests(SynchronousTestCase):
 
 class AuditRouteTests(SynchronousTestCase):
     def test_tell_operators(self) -> None:
-        """An operator reads the requested number of lines, newest first; a viewer must not read them."""
+        """An operator can read the requested number of lines, newest first; a viewer cannot read any."""
         state = format_state([], [], {}, node="vaio")
         client = create_app(lambda: state, Services(MemoryTeamControl(), Guests())).test_client()
         bearer = {"Authorization": "Bearer operator"}

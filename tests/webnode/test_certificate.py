@@ -90,7 +90,7 @@ class LeafTests(SynchronousTestCase):
         return self.leaf.find_flaw(self.signer, self.names if names is None else names, now)
 
     def test_serve_for_a_year_less_a_month(self) -> None:
-        """A certificate is valid until a month before its end; later, and before its start, it has a flaw."""
+        """A certificate has a flaw before its start, and from a month before its end; it has none in between."""
         self.assertEqual(self.flaw(), "")
         self.assertEqual(self.flaw(NOW + (VALIDITY - RENEWAL_MARGIN).total_seconds() - 3 * DAY), "")
         self.assertEqual(self.flaw(NOW + (VALIDITY - RENEWAL_MARGIN).total_seconds()), "the certificate expires soon")
@@ -99,13 +99,16 @@ class LeafTests(SynchronousTestCase):
         self.assertEqual(lasts, timedelta(days=365))
 
     def test_name_what_it_lacks(self) -> None:
-        """A missing address is a flaw; a name that the authority cannot sign is not."""
+        """A certificate that lacks an address of the node has a flaw.
+
+        A missing name that the authority cannot sign is no flaw.
+        """
         self.assertEqual(self.flaw(names=["192.168.0.8"]), "the certificate lacks 192.168.0.8")
         self.assertEqual(self.flaw(names=["8.8.8.8", "example.org", "fe80::1%eth0", "", "a b.local", "-"]), "")
         self.assertEqual(self.flaw(names=["::ffff:192.168.0.7", "VAIO.local.", "127.0.0.1", "localhost"]), "")
 
     def test_tell_a_foreign_one(self) -> None:
-        """A certificate of a different authority, or with a key that does not belong to it, is rejected."""
+        """A certificate of a different authority is rejected, and so is a private key that does not match."""
         self.assertIn("another authority", self.leaf.find_flaw(make_authority(bytes(32), "vaio"), self.names, NOW))
         other = make_leaf(self.signer, "vaio", self.names, NOW, random.Random(2))
         self.assertIn("key", Leaf(other.key, self.leaf.certificate).find_flaw(self.signer, self.names, NOW))

@@ -169,7 +169,7 @@ class ChannelTests(SynchronousTestCase):
         self.assertFalse(self.is_closed(self.opened().send(b"GET / HT")))
 
     def test_bear_some_streams_of_an_address(self) -> None:
-        """The third open response to an address is rejected; when one of them ends, the next request is accepted."""
+        """An address can have two open responses; a third request is rejected until one of the responses has ended."""
         held = [self.opened().ask("/held") for _ in range(2)]
         third = self.opened().ask("/held")
         self.assert_refused(third, 503, "open requests")

@@ -100,7 +100,10 @@ class DiagnosticsTests(FleetCase):
         return self.done(self.team, self.diagnostics.query_links(), ANSWER_LIMIT_S + 1)
 
     def test_tell_how_each_is_reached(self) -> None:
-        """Each of three nodes lists its paths to the two others; the next read contains the scores of the paths."""
+        """Each of three nodes lists its paths to the other two nodes.
+
+        The scores of the paths are in the results of the second request.
+        """
         told = self.links()
         self.assertEqual((told["here"], list(told["devices"]), told["silent"]), (self.dogs[0], self.dogs, []))
         self.assertEqual({way["score"] for view in told["devices"].values() for way in view["links"]}, {None})
@@ -172,7 +175,10 @@ class DiagnosticsTests(FleetCase):
             self.assertTrue(0 < size < told["bytes"] < told["most_bytes"])
 
     def test_say_who_did_not_answer(self) -> None:
-        """A silent device gives status 504; a device without the method, and a missing device, give status 409."""
+        """A request to a silent device gives status 504.
+
+        A request to a device without the method, or to a missing device, gives status 409.
+        """
         self.assertEqual(self.assertRaises(Refusal, self.diagnostics.query_inventory, "ff").status, 409)
         self.team.nodes[1].entangled.endpoint.expose("device.inventory", _refuse)
         waiting = self.diagnostics.query_inventory(self.dogs[1])

@@ -33,7 +33,7 @@ class EventLogTests(SynchronousTestCase):
         self.heard = 0
 
     def saw(self, now: float, *devices: dict[str, Any], tasks: Any = (), groups: Any = None, **more: Any) -> list[str]:
-        """Return the new entries for a team of these devices; ``more`` is merged into the state."""
+        """Record the state of a team of these devices, with ``more`` merged into the state; return the new entries."""
         gone = self.departed.update(devices, now)
         state: State = {**format_state(devices, tasks, groups or {}, departed=gone, node="vaio"), **more}
         self.event_log.record_state(state, now)
@@ -140,7 +140,10 @@ class EventLogTests(SynchronousTestCase):
         self.assertEqual(len(self.takeover()), 1)
 
     def test_forget_a_loss_that_mends(self) -> None:
-        """A device that returns and continues was not replaced, even if a different device takes over later."""
+        """If a lost device returns and continues, its loss is forgotten.
+
+        If a different device acts later, a handover without a time is logged.
+        """
         tasks = [job("EXECUTING")]
         self.saw(1.0, dog(1, "EXECUTING", "t1"), tasks=tasks)
         self.saw(2.0, tasks=tasks)

@@ -62,7 +62,7 @@ class TeamFallbacksTests(FleetCase):
         return swarm, webs
 
     def test_know_each_other(self) -> None:
-        """Each web node lists its own page first, then the page of the other, and accepts requests from that page."""
+        """Each web node lists its own page first, then the page of the other node, from which it accepts requests."""
         _, (first, second) = self.web_nodes()
         self.assertEqual([page.url for page in first.list_pages()], ["http://127.0.0.1:8080", "http://127.0.0.1:8081"])
         self.assertEqual([page.is_self for page in second.list_pages()], [True, False])
@@ -90,7 +90,10 @@ class TeamFallbacksTests(FleetCase):
         self.assertFalse(second.can_authenticate(keys[0]))
 
     def test_let_in_the_page_of_the_dead(self) -> None:
-        """A failed web node is not listed, but for an hour requests from its page in a browser are accepted."""
+        """A failed web node is not listed.
+
+        Its page can still be open in a browser, so requests from that page are accepted for an hour.
+        """
         swarm, (first, second) = self.web_nodes()
         swarm.nodes[0].stop_silently()
         swarm.run(3)

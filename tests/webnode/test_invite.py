@@ -46,7 +46,7 @@ class InviteTests(SynchronousTestCase):
         test_draw_what_a_camera_reads.skip = f"THE QR CODE IS NOT TESTED: missing {missing}"  # type: ignore[attr-defined]
 
     def test_draw_nothing_where_it_cannot(self) -> None:
-        """An empty link gives no drawing; nor does a missing library."""
+        """For an empty link, or without the library, no QR code is drawn."""
         self.assertEqual(make_qr_code(""), "")
         self.addCleanup(sys.modules.update, {"segno": sys.modules["segno"]} if "segno" in sys.modules else {})
         self.addCleanup(sys.modules.pop, "segno", None)

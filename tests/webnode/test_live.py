@@ -72,7 +72,10 @@ class EventStreamsTests(SynchronousTestCase):
         return Connection(self.site).ask(f"/events{query}", **headers)
 
     def test_start_with_everything(self) -> None:
-        """A new page receives state, map, pages and beat immediately, in a stream that is not cached."""
+        """A new page immediately receives the state, the map, the list of web pages and the first beat.
+
+        The response is not cached.
+        """
         data = self.connected().taken()
         self.assertIn(b"text/event-stream", data)
         self.assertIn(b"no-store", data)
@@ -218,9 +221,9 @@ class EventStreamsTests(SynchronousTestCase):
         self.assertEqual(told, sorted(told))
 
     def test_put_off_slow_pages(self) -> None:
-        """A page that does not read receives nothing.
+        """A page that does not read its stream receives nothing.
 
-        When it reads again, it receives the missed changes and their number.
+        When the page reads again, it receives the missed changes and their number.
         """
         self.state["more"] = MORE
         slow, quick = self.connected(), self.connected()
@@ -345,7 +348,7 @@ class CameraImagesTests(SynchronousTestCase):
         self.assertIn(b" 204 ", page.taken())
 
     def test_open_a_silent_upstream_anew(self) -> None:
-        """A silent upstream is opened again while requests wait, because the device may have a new address."""
+        """While requests wait, a silent upstream is opened again, because the device can have a new address."""
         self.asked()
         self.clock.advance(5)
         page = self.asked()
@@ -354,7 +357,7 @@ class CameraImagesTests(SynchronousTestCase):
         self.assertEqual(self.frames.opened, 2)
 
     def test_hold_one_question_a_viewer(self) -> None:
-        """A new request of a viewer ends the older request of this viewer with 204; other viewers are not affected."""
+        """A new request of a viewer ends the viewer's older request with status 204; other viewers are not affected."""
         first, other = self.asked(viewer="a"), self.asked(viewer="b")
         second = self.asked(viewer="a")
         self.assertIn(b" 204 ", first.taken())

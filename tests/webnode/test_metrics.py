@@ -60,7 +60,10 @@ class MetricsTests(SynchronousTestCase):
         self.assertEqual(told["swarm_page_time_seconds", ()], 9.5)
 
     def test_tell_the_page(self) -> None:
-        """Connections are counted by kind, requests by role and status; requests for the metrics are not counted."""
+        """Connections are counted by kind, and requests by role and status.
+
+        Requests for the metrics themselves are not counted.
+        """
         self.limits.count("stream", "10.0.0.1", 2)
         self.services.audit.write(User("ann", "operator"), "h", "POST /x", "", "409 it left")
         told = self.read()

@@ -67,7 +67,10 @@ class DocumentTests(SynchronousTestCase):
             self.assertEqual((told["security"], told["x-role"]), ([{each: []} for each in wanted], role))
 
     def test_say_what_is_given(self) -> None:
-        """A media type is documented as such, other responses as JSON with a description, errors by reference."""
+        """A response with a media type is documented with this type, any other as JSON with a description.
+
+        Errors are documented by a reference to a shared description.
+        """
         picture = self.operation(Route("GET", "/shot", "A picture", "viewer", None, response="image/jpeg"))
         self.assertEqual(list(picture["responses"]["200"]["content"]), ["image/jpeg"])
         order = self.operation(Route("POST", "/api/v1/x", "X", "operator", lambda ask: {}, response="id", status=202))

@@ -17,7 +17,7 @@ from webnode.request_guard import (
 
 class GuardTests(SynchronousTestCase):
     def test_know_local_names(self) -> None:
-        """An address, a bare name and a name of the local network can belong to a local machine."""
+        """An IP address, a name without a dot, and a name of the local network can belong to a local machine."""
         hosts = ["10.0.0.7:8080", "[::1]:8080", "[fe80::1]", "localhost:8080", "vaio", "vaio.local:80", "VAIO.LAN"]
         for host in hosts:
             self.assertTrue(is_local_name(host), host)

@@ -92,7 +92,7 @@ class TeamRevocationsTests(SynchronousTestCase):
             self.assertEqual(read_revocations(record), {})
 
     def test_remember_so_many(self) -> None:
-        """The revocations in memory are limited as well: the oldest revocation is dropped."""
+        """The number of revocations in memory is limited as well: the oldest revocation is dropped."""
         twin = Revocations()
         for number in range(MAX_KNOWN + 1):
             twin.revoke(str(number), 1.0)

@@ -184,7 +184,7 @@ class QuickReactor:
 
 class CallerTests(SynchronousTestCase):
     def test_bring_the_answer(self) -> None:
-        """The caller receives the result of the call, also from a Deferred, and raises its refusals."""
+        """The caller receives the result of the call, also from a Deferred; a ``Refusal`` is raised in the caller."""
 
         def refuse() -> None:
             raise Refusal("name", "no", "ask another", 404)

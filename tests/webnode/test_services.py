@@ -19,7 +19,7 @@ class ServicesTests(SynchronousTestCase):
         self.assertGreater(token.until, 5.0)
 
     def test_say_what_it_has(self) -> None:
-        """``feature_names`` lists only optional parts that the node has; the map is listed if it exists."""
+        """``feature_names`` lists only the optional parts that the node has, including the map if there is one."""
         self.assertEqual(Services(MemoryTeamControl(), OpenSessions()).feature_names, [])
         control = MemoryTeamControl(robot_map={"walls": [3.0, 2.4], "dogs": [], "target": None})
         self.assertEqual(Services(control, OpenSessions()).feature_names, ["yard"])

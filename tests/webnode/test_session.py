@@ -95,7 +95,7 @@ class SignedSessionsTests(SynchronousTestCase):
         self.assertEqual(refusal.status, 401)
 
     def test_believe_gateways_alone(self) -> None:
-        """A session is invalid while one of its vouching nodes is not a gateway.
+        """A session is invalid while one of the nodes that vouched for it is not a gateway.
 
         Only gateways allow signing in.
         """
@@ -151,7 +151,10 @@ class SignedSessionsTests(SynchronousTestCase):
         self.assertEqual(self.refused("correct hors").status, 401)
 
     def test_check_two_passwords_at_once(self) -> None:
-        """Two passwords are checked at a time, some wait, and the rest get status 503; each counts as an attempt."""
+        """Two passwords are checked simultaneously, some wait, and all further ones get status 503.
+
+        Each of them counts as an attempt.
+        """
         asked: list[Deferred[bool]] = []
 
         def check(text: str, word: str) -> Deferred[bool]:
@@ -225,7 +228,7 @@ class FactoryTests(SynchronousTestCase):
         return make_sessions(settings, cast(Any, node), None, random.Random(1), cast(Any, team))
 
     def test_have_the_code_of_the_settings(self) -> None:
-        """The code is that in the settings, or else a random code without ambiguous letters."""
+        """The access code is set in the settings; otherwise it is random and contains no ambiguous letters."""
         self.assertEqual(self.made(code="quiet-otter").code, "quiet-otter")
         self.assertRegex(self.made().code, r"^[a-hj-km-np-z]{4}-[a-hj-km-np-z]{4}$")
         self.assertNotEqual(draw_code(random.Random(1)), draw_code(random.Random(2)))

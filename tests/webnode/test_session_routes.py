@@ -125,7 +125,7 @@ class SessionRouteTests(SynchronousTestCase):
             self.assertEqual(self.client.post("/api/v1/invitations", json=wrong, headers=bearer).status_code, 400)
 
     def test_invite_by_a_link(self) -> None:
-        """An invitation has a link to the best page; the link for a phone opens the phone's view."""
+        """An invitation contains a link to the best URL of the page; the link for a phone opens the view for phones."""
         bearer = self.bearer(self.signed(code="quiet-otter")["token"])
         self.services.invites = MemoryInvites("https://10.0.0.7:8443", "http://10.0.0.7:8080", "http://127.0.0.1:8080")
 

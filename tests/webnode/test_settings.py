@@ -68,7 +68,7 @@ class TunerTests(SynchronousTestCase):
         self.assertNotIn("gripper", self.row()["capabilities"])
 
     def test_lease_says_how_soon_a_loss_is_seen(self) -> None:
-        """With a lease of 4 s the loss of a failed device is noticed after 3 to 5 s, with a short lease within 1 s."""
+        """With a lease of 4 s the loss of a failed device is noticed after 3 to 5 s, with one of 0.4 s within 1 s."""
         for lease, earliest, latest in ((4.0, 2.6, 5.0), (0.4, 0.2, 1.0)):
             self.change(presence_lease=lease)
             self.team.clock.advance(6.0)
@@ -115,7 +115,7 @@ class TunerTests(SynchronousTestCase):
         self.assertEqual(self.told(), before)
 
     def test_device_that_is_gone_is_told(self) -> None:
-        """Reading the settings of a device that has just failed gives status 409."""
+        """If a device has just failed, reading its settings gives status 409."""
         self.team.kill("dog1")
         asked = read_settings(self.team.control, self.node.uuid)
         self.team.clock.advance(2.0)

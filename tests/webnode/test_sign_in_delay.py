@@ -67,7 +67,10 @@ class SignInDelaysTests(SynchronousTestCase):
         self.assertLessEqual(self.delays.get_wait("a", 0.0), LONGEST_S)
 
     def test_take_a_try_back(self) -> None:
-        """``uncount_attempt`` uncounts a successful attempt; wrong attempts count. The limits are configurable."""
+        """``uncount_attempt`` removes a successful attempt from the count, so only wrong attempts count.
+
+        The limits are configurable.
+        """
         delays = SignInDelays(free=3, longest_s=10.0, forgotten_s=100.0)
         for _ in range(20):
             delays.count_attempt("everywhere", 0.0)

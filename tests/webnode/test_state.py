@@ -85,14 +85,20 @@ class StateTests(SynchronousTestCase):
 
 class GroupTests(SynchronousTestCase):
     def test_agree(self) -> None:
-        """If all members choose the same agent, that agent is the assigned agent, and the costs share one scale."""
+        """If all members choose the same agent, that agent is assigned.
+
+        Each cost is also given as a share of the highest cost.
+        """
         view = make_group_view("t", "T", [member(3, 2.0, 2), member(1, 1.0, 2), member(2, 0.5, 2)])
         self.assertEqual((view["assigned"], view["agree"], view["of"]), ("dog2", 3, 3))
         self.assertEqual([each["share"] for each in view["members"]], [0.5, 0.25, 1.0])
         self.assertEqual((view["differ"], view["undecided"]), ([], []))
 
     def test_differ(self) -> None:
-        """Members with a different choice, and undecided members, are listed; a member without a cost has no share."""
+        """Members with a different choice, and undecided members, are listed.
+
+        A member without a cost has no share of the highest cost.
+        """
         view = make_group_view(
             "t", "T", [member(1, 1.0, 1), member(2, 0.5, 2), member(3, 0.7, 2), member(4, None, None)]
         )
@@ -149,7 +155,7 @@ class DepartedDevicesTests(SynchronousTestCase):
         self.assertEqual(departed.update(both[1:], 161.0), [])
 
     def test_forget_when_back(self) -> None:
-        """A device that returns is present immediately; if it is lost again, the time of loss is new."""
+        """A device that returns is listed as present immediately; a second loss gets a new time of loss."""
         departed = DepartedDevices()
         departed.update([device(1)], 1.0)
         self.assertEqual(len(departed.update([], 2.0)), 1)

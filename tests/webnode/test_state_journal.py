@@ -54,7 +54,7 @@ class JournalTests(SynchronousTestCase):
         self.assertEqual(self.journal.list_since(self.journal.parse_event_id(self.journal.make_event_id(3))), [])
 
     def test_tell_all_after_a_gap(self) -> None:
-        """If an id is too old, in the future, invalid, or from another node or run, the whole state is sent."""
+        """If an id is too old, too high, invalid, or from another node or before a restart, the whole state is sent."""
         for n in range(MAX_CHANGES + 3):
             self.taken(state(a=n))
         for name in ("ab-1", "ab-2", "ac-60", "ab-999", "ab-", "ab-x", "ab--1", "", "ab-" + "9" * 40, "ab-²"):

@@ -35,7 +35,7 @@ class TeamControlTests(SynchronousTestCase):
         return refusal
 
     def test_say_who_has_a_message(self) -> None:
-        """A message to all devices returns its recipients, and for each other device the reason."""
+        """A message to all devices returns its recipients, and the reason for each device that did not receive it."""
         told = self.control.send_message("", "sit")
         self.team.clock.advance(0.1)
         self.assertEqual(self.successResultOf(told), {"delivered": ["dog1", "dog2", "vaio"], "failed": {}})
@@ -105,7 +105,10 @@ class TeamControlTests(SynchronousTestCase):
         self.assertEqual(self.control.preview("turn-around", "yard")["together"], [])
 
     def test_preview_by_what_is_reported(self) -> None:
-        """While an equal task is running, the preview uses its reports to show busy devices and the nearest device."""
+        """While an equal task is running, the preview shows busy devices and the nearest device.
+
+        It uses the reports of the devices on the running task.
+        """
         self.team.run_demo()
         for _ in range(60):
             self.team.clock.advance(0.5)

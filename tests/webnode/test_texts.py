@@ -21,7 +21,7 @@ CODE = re.compile(
     r"(?:\b(?:class|d|for|href|id|rel|role|type|viewBox)\"?: "
     r"|(?:querySelector(?:All)?|closest|closest\?\.|matchMedia|matches)\()$"
 )
-"""Matches the code in front of a string that is a class, an attribute or a selector."""
+"""Matches the code in front of a string if the string is a CSS class, an attribute or a selector."""
 NO_TEXT = {
     " KiB": "a unit",
     " MiB": "a unit",

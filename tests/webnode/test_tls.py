@@ -38,7 +38,7 @@ if not MISSING:
 SKIP = f"TLS IS NOT TESTED: missing {', '.join(MISSING)} (pip install 'swarm-node[tls]')"
 NOW = 1.8e9
 NO_CHECK_TIME = 0x200000
-"""X509_V_FLAG_NO_CHECK_TIME of OpenSSL: the client uses the real time, but the certificate the time of the test."""
+"""X509_V_FLAG_NO_CHECK_TIME of OpenSSL, because the certificate is valid at the test's time, not at the real time."""
 DAY = 86400.0
 
 
@@ -278,7 +278,7 @@ class HandshakeTests(SynchronousTestCase):
         return b""
 
     def test_let_little_wait_for_a_slow_reader(self) -> None:
-        """With TLS the send buffers are as small as without TLS: the option is set on the socket below TLS."""
+        """With TLS the send buffers are as small as without TLS, because the option is set on the socket below TLS."""
         connection = self.connected()
         with socket.socket() as below:
             connection.transport.getHandle = lambda: below  # type: ignore[attr-defined]

@@ -21,7 +21,10 @@ CLAIM = Claim("ab" * 8, "operator", "operator", 2_000_000_000, limit=2_000_100_0
 
 class TokenTests(SynchronousTestCase):
     def test_read_what_was_signed(self) -> None:
-        """A node accepts a token that it signed, and adds itself as a voucher; other nodes reject the token."""
+        """A node accepts a token that it signed, and appears in the token's list of vouchers.
+
+        Other nodes reject the token.
+        """
         for claim in (CLAIM, CLAIM.ticket, replace(CLAIM, role="phone", name="Z\N{SNOWMAN}", parents=("cd" * 8,))):
             text = VAIO.sign_token(claim)
             self.assertRegex(text, r"^[\w.-]+$")

@@ -53,7 +53,7 @@ class PlayedTeam:
         self.switchboard.counters["sent"] += 10
 
     def get_statuses(self) -> Mapping[str, AgentStatus]:
-        """Return the status of each agent. There is no cost before the target is placed."""
+        """Return the status of each agent; before the target is placed, a status contains no cost."""
         crowd, target = self.simulator.crowd, self.simulator.crowd.target
         if target is None:
             return {name: AgentStatus(None, "") for name in self.simulator.names}
@@ -80,7 +80,10 @@ class ImpatientTeam(PlayedTeam):
 
 class SearchTests(SynchronousTestCase):
     def test_moments_are_noted(self) -> None:
-        """``search`` records when agents take part, see the target, agree and arrive, and whether the right one did."""
+        """``search`` records when agents take part, see the target, agree and arrive.
+
+        It also records whether the agent that arrived was the nearest one.
+        """
         outcome = run_search(PlayedTeam(1, 4, make_square_scene(9)), 1, 60.0, lambda: 0.0)
         self.assertEqual((outcome.engaged, outcome.first, outcome.found), (0.5, 5.0, 4))
         self.assertEqual((outcome.agree, outcome.reach, outcome.right), (6.5, 7.5, True))
@@ -90,7 +93,7 @@ class SearchTests(SynchronousTestCase):
         self.assertEqual((wrong.right, "NO" in format_table(wrong)), (False, True))
 
     def test_limit_and_end_leave_a_report(self) -> None:
-        """A search that ends early, at its limit or because of ``is_over``, reports the results so far."""
+        """A search that its time limit or ``is_over`` ends early reports the results so far."""
         team = PlayedTeam(1, 4, make_square_scene(9))
         short = run_search(team, 1, 2.0, lambda: 0.0)
         ended = run_search(team, 1, 60.0, lambda: 0.0, is_over=lambda: team.clock.seconds() > 3.22)
@@ -145,7 +148,7 @@ class CommandTests(SynchronousTestCase):
         self.assertEqual(signal.getsignal(signal.SIGINT), usual)
 
     def test_wrong_words_are_refused(self) -> None:
-        """Invalid arguments are rejected before the simulation starts; one line contains a remedy."""
+        """Invalid arguments are rejected before the simulation starts; the error is one line with a remedy."""
         for words, problem in (
             (("--bodies", "0"), "bodies must be"),
             (("--room", "0.01"), "room must be"),

@@ -139,7 +139,7 @@ class ControllerTests(SynchronousTestCase):
         return senses
 
     def test_disperse(self) -> None:
-        """``disperse`` increases the mean range of robots that start close together."""
+        """``disperse`` moves robots apart that start close together: the mean of their measured ranges increases."""
         crowd = Crowd(1, CrowdScene(60, 9.0, 9.0))
         number = np.arange(60)
         crowd.x[:], crowd.y[:], crowd.heading[:] = 2.5 + 0.3 * (number % 8), 2.5 + 0.3 * (number // 8), 0.4 * number

@@ -190,7 +190,10 @@ class DrivenTests(SynchronousTestCase):
         return values["bump.left"], values["bump.right"]
 
     def test_wrong_numbers_are_refused(self) -> None:
-        """Invalid numbers of drivers, a driver for a robot without one, and one connection too many are rejected."""
+        """An invalid number of drivers is rejected, and so is a connection beyond the limit.
+
+        A driver for a robot that is not controlled by a driver is also rejected.
+        """
         for driven in (-1, 6, 1.5, True):
             self.assertRaises(SceneError, CrowdSimulator, self.clock, Random(1), CrowdScene(5, 6.0, 4.0), driven)
         self.assertEqual(self.driver("robot3").state, "closed")

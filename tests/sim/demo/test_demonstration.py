@@ -56,7 +56,8 @@ class ExperimentTests(SynchronousTestCase):
     def test_verdicts(self) -> None:
         """An experiment passes if the nearest dog reaches the target.
 
-        It fails if the claim is false, another dog finishes, no dog was lost, or the lost dog finishes.
+        It fails if the task fails, if the dog that finishes is not at the target or is not the nearest dog, and, in
+        experiment 2, if no dog was lost or the lost dog finishes.
         """
         wrong = state("EXECUTING", dog2="EXECUTING")
         for kills, looks, held, words in (
@@ -76,9 +77,9 @@ class ExperimentTests(SynchronousTestCase):
             self.assertEqual(list(row["checks"].values()), [check.is_met for check in run.list_checks()])
 
     def test_who_is_killed(self) -> None:
-        """``update`` returns the moving dog once, after 0.1 m or half of its way.
+        """``update`` returns the dog to kill: once, when the moving dog has walked 0.1 m or half of its way.
 
-        It never does so in experiment 1, or if the dog has left.
+        In experiment 1, and if the moving dog has left, ``update`` returns no dog.
         """
         gone = state("EXECUTING", gone=1.0, dog1="EXECUTING")
         for kills, seen, ways, named in (
@@ -178,14 +179,17 @@ class ConfigurationTests(SynchronousTestCase):
         self.assertEqual((dog["driver"]["kind"], dog["driver"]["options"]["robot"]), ("sim", "dog2"))
 
     def test_every_node_is_a_member(self) -> None:
-        """The arguments that found the team list each node that has a file; no configuration contains a team key."""
+        """The arguments of ``swarm init`` list each node that has a file; no configuration contains a team key."""
         words = self.plan.make_init_arguments()
         members = [word.partition("=")[0] for flag, word in zip(words, words[1:], strict=False) if flag == "--member"]
         self.assertEqual([words[words.index("--first") + 1], *members], list(self.tables))
         self.assertNotIn("team_key", str(self.tables))
 
     def test_every_cast_is_known_to_its_drivers(self) -> None:
-        """The emulators of each cast match the drivers, all ports differ, and one Aibo speaks the older dialect."""
+        """For each value of ROBOT the emulators match the drivers, and all ports differ.
+
+        One Aibo speaks the older dialect.
+        """
         self.assertEqual(self.plan.emulated_robots, "")
         for wish in ROBOT_SETS:
             ports = iter(range(9000, 9000 + MAX_PORTS * len(DOGS)))
@@ -205,7 +209,7 @@ class ConfigurationTests(SynchronousTestCase):
             self.assertEqual(dialects, [None, None, "T2" if wish == "aibo" else None])
 
     def test_two_nodes_serve_the_page(self) -> None:
-        """Laptop and reserve serve the page and the map, each on its own ports, and over TLS if the plan says so."""
+        """Both web nodes serve the page and the map on their own ports, and over TLS if the plan has ports for TLS."""
         web = {"host": "127.0.0.1", "port": 8080, "yard": "127.0.0.1:7400", "code": "quiet-otter"}
         secure = self.read(replace(self.plan, tls_ports=(8443, 8444)))
         for name, wanted, tls_port in (("vaio", web, 8443), ("pi", {**web, "port": 8081}, 8444)):

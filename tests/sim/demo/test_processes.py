@@ -78,7 +78,10 @@ class TeamTests(SynchronousTestCase):
         return team, reactor
 
     def test_processes_start_on_a_leash_and_are_heard(self) -> None:
-        """Each process ends with its parent; its output lines reach the listener, its log file and its tail."""
+        """Each process ends with its parent.
+
+        The output lines of a process reach the listener, the log file and the list of its last lines.
+        """
         team, reactor = self.team()
         self.assertEqual(reactor.started[0].arguments, make_child_command(["-m", "x"]))
         self.assertEqual((team.get_pid("dog1"), team.get_pid("dog2"), team.list_ended()), (100, 101, []))

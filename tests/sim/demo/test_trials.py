@@ -94,7 +94,7 @@ class TrialTests(SynchronousTestCase):
         self.assertTrue(all(path.read_bytes()[:4] == b"\x89PNG" for path in folder.iterdir()))
 
     def test_percentile_is_a_value_that_was(self) -> None:
-        """A percentile is the smallest measured value that covers the share, without interpolation."""
+        """A percentile is a measured value: the smallest one that the given share of the values does not exceed."""
         values = [5.0, 1.0, 4.0, 2.0, 3.0]
         self.assertEqual([percentile(values, share) for share in (0.0, 0.2, 0.21, 0.5, 0.95, 1.0)], [1, 1, 2, 3, 5, 5])
 

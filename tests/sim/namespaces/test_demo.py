@@ -24,7 +24,10 @@ def places() -> dict[str, Location]:
 
 class NatDemoTests(SynchronousTestCase):
     def test_nobody_is_told_of_this_machine(self) -> None:
-        """With each cast all configurations are valid; neither they nor the emulators use the loopback address."""
+        """For each value of ROBOT all configurations are valid.
+
+        Neither the configurations nor the emulators use the loopback address.
+        """
         for cast in ROBOT_SETS:
             plan = make_namespace_plan(Path("/nowhere"), cast, places(), "over-there")
             for name, text in plan.make_configs().items():

@@ -29,7 +29,7 @@ class LinkDirectionTests(SynchronousTestCase):
             self.assertEqual((lossy.lost, lossy.passed), (lost, MANY - lost))
 
     def test_losses_come_in_bursts(self) -> None:
-        """With a burst length of five the loss rate is the same, and about five consecutive frames are lost."""
+        """With a burst length of five the loss rate is the same, and on average five consecutive frames are lost."""
         bursty = line(loss=20.0, burst=5.0)
         fates = [not bursty.draw_delivery_times(100, 0.0) for _ in range(MANY)]
         self.assertApproximates(sum(fates) / MANY, 0.2, 0.03)

@@ -292,7 +292,7 @@ class HistoryTests(SynchronousTestCase):
         return history
 
     def test_order(self) -> None:
-        """A history lists the events in their order of time."""
+        """A history lists the events in the order of their times."""
         wanted = [Asked(1.0, 1, "client", "put", ("job", 1)), Died(2.0, 3), Answered(2.5, 1, "done")]
         self.assertEqual(list(self.made("done")), wanted)
 

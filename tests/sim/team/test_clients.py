@@ -62,7 +62,10 @@ class ClientTests(SynchronousTestCase):
         self.assertEqual(self.clients.list_slots(b"somebody else"), [])
 
     def test_reads(self) -> None:
-        """A read returns the records; the history contains the number read from each slot, 0 for an empty slot."""
+        """A read returns the records.
+
+        The history contains, for each slot, the number of the write that was read, and 0 for an empty slot.
+        """
         owner = self.peer.identity.public
         self.peer.answer = [
             Record(KEY, name, owner, 1, "team", 60.0, value, b"") for name, value in (("a", b"3"), ("b", None))

@@ -63,7 +63,10 @@ class CommandTests(SynchronousTestCase):
         return run(["--scenario", str(self.path), *words], world, KINDS)
 
     def test_report_is_for_people_and_programs(self) -> None:
-        """Table, hash and command are printed; the JSON file adds time series; trace and figure show the fault."""
+        """The table, the hash and the command that repeats the run are printed.
+
+        The JSON file also contains time series; the trace and the figure show the fault.
+        """
         files = [str(self.folder / name) for name in ("r.json", "t.jsonl", "p.svg")]
         self.assertEqual(self.run_it("--seed", "3", "--json", files[0], "--trace", files[1], "--picture", files[2]), 0)
         report = json.loads(Path(files[0]).read_text())
@@ -138,7 +141,7 @@ class TraceTests(SynchronousTestCase):
     """Tests of ``Trace``."""
 
     def test_each_event_is_a_line_up_to_a_bound(self) -> None:
-        """The trace has one JSON object per line; events beyond the limit are counted only."""
+        """The trace has one JSON object per line; events beyond the limit are only counted."""
         out = io.StringIO()
         trace = Trace(out, 2)
         trace.begin(seed=3)

@@ -52,7 +52,7 @@ class DiskTests(SynchronousTestCase):
         self.assertEqual(reborn.find_expiry(_record("safe").slot), self.clock.seconds() + 60.0)
 
     def test_third_life_has_what_the_first_wrote(self) -> None:
-        """A record survives two restarts in a row."""
+        """A record survives two consecutive restarts."""
         self.disk.put(_record("old"), 60.0)
         self.clock.advance(1.0)
         second = self._reborn()

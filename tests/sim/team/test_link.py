@@ -45,7 +45,7 @@ class TeamLinkTests(SynchronousTestCase):
         self.assertEqual(_sent(TeamLink(LinkSettings("none"), "1"), 3), [[0.0]] * 3)
 
     def test_loss_comes_one_by_one_or_in_bursts(self) -> None:
-        """Bursts do not change the loss rate; only with bursts are losses consecutive."""
+        """With and without bursts the loss rate is the same; with bursts most losses are consecutive."""
         for burst, follow in ((0.0, 0.1), (0.02, 0.95)):
             lost = [not delays for delays in _sent(TeamLink(LinkSettings("lan", loss=0.1, burst=burst), "1"), 60_000)]
             self.assertApproximates(sum(lost) / len(lost), 0.1, 0.015)

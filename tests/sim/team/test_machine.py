@@ -23,7 +23,7 @@ class MachineTests(SynchronousTestCase):
         self.seen: list[object] = []
 
     def test_clock_runs_at_its_own_rate(self) -> None:
-        """The timers of a fast clock fire early; a new rate does not change the times that have passed."""
+        """The timers of a fast clock fire early; a new rate does not change the time that has already passed."""
         machine = Machine(self.world, 2.0, 100.0)
         verifyObject(IReactorTime, machine)
         machine.callLater(4.0, lambda: self.seen.append(self.world.seconds()))
@@ -71,7 +71,7 @@ class MachineTests(SynchronousTestCase):
         self.assertEqual(self.seen, ["first", "second", b"hello"])
 
     def test_overdue_timer_can_be_cancelled(self) -> None:
-        """An overdue timer is still active: an overdue timer that runs earlier can cancel it."""
+        """An overdue timer stays active until it runs, so an overdue timer that runs first can cancel it."""
         machine = Machine(self.world)
         first = machine.callLater(1.0, lambda: second.cancel())
         second = machine.callLater(1.0, self.seen.append, "second")
@@ -84,7 +84,7 @@ class MachineTests(SynchronousTestCase):
         self.assertRaises(AlreadyCalled, first.cancel)
 
     def test_clock_that_stops_while_suspended(self) -> None:
-        """A clock includes the time of a suspension. If ``COUNTS_SUSPENSION`` is false, the clock lags by that time."""
+        """A clock normally counts the time of a suspension; if ``COUNTS_SUSPENSION`` is false, it lags by that time."""
         for counts, shown in ((True, 8.0), (False, 2.0)):
             self.world = HeapClock()
             machine = Machine(self.world, 2.0)
@@ -107,7 +107,7 @@ class MachineTests(SynchronousTestCase):
         self.assertEqual((len(self.seen), self.seen[0]), (MAX_QUEUED_DATAGRAMS, b"0"))
 
     def test_dead_machine_does_nothing(self) -> None:
-        """Timers of a dead machine never run, even if the machine was frozen."""
+        """Timers of a dead machine never run, even if the machine was frozen when it died."""
         machine = Machine(self.world)
         machine.callLater(1.0, self.seen.append, "late")
         machine.freeze()

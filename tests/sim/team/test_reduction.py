@@ -1,4 +1,4 @@
-"""Tests of the reduction of failing runs; a rule decides whether a reduced run fails."""
+"""Tests of the reduction of failing runs; a function decides whether a reduced run fails, without a simulation."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class MinimizeTests(SynchronousTestCase):
             self.assertLess(next(tries), 60)
 
     def test_none_can_be_dropped(self) -> None:
-        """If several sets of faults cause the failure, the result causes it too, and contains no superfluous fault."""
+        """If several sets of faults cause the failure, the result is one of them, without superfluous faults."""
 
         def fails(kept: tuple[int, ...]) -> bool:
             return {1, 2} <= set(kept) or {5, 6, 7} <= set(kept)

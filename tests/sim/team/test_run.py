@@ -68,7 +68,10 @@ class RunTests(SynchronousTestCase):
         return run, [(round(now - began, 6), event, place) for now, event, place in events if now >= began]
 
     def test_workloads_act_while_it_lasts(self) -> None:
-        """Workloads step at the scenario's interval, are told when the repair ends, and are compared to the targets."""
+        """Workloads step at the scenario's interval, and are notified when the repair ends.
+
+        The values that they measure are compared with the targets.
+        """
         run = Run(replace(BASE, repair=5.0, targets=(("steps", Bound(19)),)), 1, KINDS)
         outcome = run.run()
         workload = run.workloads[0][1]
@@ -80,7 +83,7 @@ class RunTests(SynchronousTestCase):
         self.assertAlmostEqual(outcome.seconds, run.expected_end)
 
     def test_workloads_wait_for_their_lead(self) -> None:
-        """Workloads with a lead start after the lead."""
+        """If the scenario has a ``lead`` time, the workloads start only after that time."""
         run = Run(replace(BASE, lead=7.5), 1, KINDS)
         run.run()
         workload = run.workloads[0][1]
@@ -104,7 +107,7 @@ class RunTests(SynchronousTestCase):
             self.assertEqual(len(outcome.digest), 32)
 
     def test_slow_machine_is_watched_as_often(self) -> None:
-        """On a slow machine the steps become shorter, so ``watched`` stays responsive; the digest does not change."""
+        """On a slow machine the steps become shorter, so ``watched`` is still called often; the digest is the same."""
         watched: dict[bool, list[float]] = {False: [], True: []}
         digests = []
         for is_slow, seen in watched.items():
@@ -154,7 +157,7 @@ class RunTests(SynchronousTestCase):
         self.assertEqual(born, [(at + 3.0, place) for at, place in killed])
 
     def test_healing_brings_all_back(self) -> None:
-        """Every fault ends before the repair: no node is cut off, frozen or down, and no disk is full."""
+        """All faults end before the repair starts: no node is then cut off, frozen or down, and no disk is full."""
         faults = tuple(
             Fault(kind, 1.0, lasts=99.0, count=2, amount=1.1 if kind == "rate" else 0.0)
             for kind in ("crash", "leave", "freeze", "cut", "deaf", "mute", "clog", "rate", "full")
@@ -178,7 +181,7 @@ class RunTests(SynchronousTestCase):
         self.assertEqual(known, [9] * 10)
 
     def test_what_lasts_ends_at_its_time(self) -> None:
-        """A partition, more loss, a fast clock, a full disk and a frozen node last for the duration of the fault."""
+        """A partition, extra loss, a fast or wrong clock, a full disk and a frozen node end when the fault ends."""
         faults = tuple(
             Fault(kind, 2.0, lasts=3.0, places=(1,), amount=1.5 if kind == "rate" else -60.0 if kind == "step" else 0.0)
             for kind in ("cut", "freeze", "rate", "full", "step")
@@ -205,7 +208,7 @@ class RunTests(SynchronousTestCase):
         self.assertEqual({seen[at] for at in seen if 2.1 < at < 4.9}, {bad})
 
     def test_crowd_comes_and_goes(self) -> None:
-        """New nodes join at new places within the time ``over`` of the fault, and leave after the time ``lasts``."""
+        """New nodes, with new indices, join during the time ``over`` of the fault, and leave after its ``lasts``."""
         run, events = self.record_events(replace(BASE, faults=(Fault("crowd", 1.0, lasts=4.0, count=4, over=2.0),)))
         self.assertEqual(
             [(at, p) for at, event, p in events if event == "born"], [(1 + n / 2, 6 + n) for n in range(4)]
@@ -228,7 +231,7 @@ class RunTests(SynchronousTestCase):
         self.assertGreater(len([1 for _, event, _ in events if event == "born"]), 0.7 * len(ended))
 
     def test_sessions_may_bring_others(self) -> None:
-        """If ``same`` is false, a different node takes the place of a node that left."""
+        """If ``same`` is false, a node that left is replaced by a node with a different identity."""
         run = Run(replace(BASE, seconds=40.0, sessions=Sessions("fixed", 15.0, 2.0, 0.5, same=False)), 1, KINDS)
         before = [run.team.identity(place) for place in range(6)]
         run.run()

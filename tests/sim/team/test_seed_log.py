@@ -42,7 +42,7 @@ class SeedLogTests(SynchronousTestCase):
         self.assertIn("line 2", str(error))
 
     def test_missing(self) -> None:
-        """A seed in the seed log is not run again, unless its workloads differ."""
+        """A seed in the seed log is run again only if the workloads differ from those of its entry."""
         logged = [ENTRY, replace(ENTRY, first=6), replace(ENTRY, first=4, what="wire")]
         self.assertEqual(find_missing(range(1, 11), logged, ""), [4, 5, 9, 10])
 

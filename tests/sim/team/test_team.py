@@ -1,4 +1,4 @@
-"""Tests of simulated teams: places, restarts and events."""
+"""Tests of simulated teams: how nodes join, restart and are replaced, and which events the listeners receive."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ class TeamTests(SynchronousTestCase):
         self.assertIn("drift", str(self.assertRaises(ValueError, team.freeze, 1)))
 
     def test_traffic_is_counted_by_place_over_all_lives(self) -> None:
-        """The traffic of all places, including earlier runs of a node, adds up to the traffic of the switchboard."""
+        """The traffic of all nodes, including their runs before a restart, adds up to that of the switchboard."""
         team = self.team(Scenario(nodes=5, join=QUICK, link=LinkSettings("none")))
         team.kill(4)
         team.start(4)

@@ -139,7 +139,7 @@ class DiagnosisTests(SynchronousTestCase):
             ({"certificate": Certificate(WALL + DAY, WALL + 9 * DAY)}, "error certificate-early", ""),
             ({"certificate": Certificate(0.0, WALL + DAY)}, "warning certificate-ends", ""),
             ({"certificate": UNREADABLE}, "error certificate-unreadable", ""),
-            # Without a readable membership no node can be verified, so unknown fingerprints are not a finding.
+            # Without a readable membership no node can be verified, so unknown fingerprints are not reported.
             ({"known": (STRANGER,), "lan": None, "certificate": UNREADABLE}, "error certificate-unreadable", ""),
         )
         self.check_well({"certificate": Certificate(WALL - DAY, WALL + 30 * DAY)})
@@ -160,9 +160,9 @@ class DiagnosisTests(SynchronousTestCase):
     def test_clock(self) -> None:
         """A clock that differs from the median clock of the peers is found.
 
-        The node's own clock and one wrong peer do not count.
+        A reply of this machine itself, and a single wrong peer, do not change the result.
 
-        A certificate that is valid by the peers' clocks is not reported as expired, because the local clock is wrong.
+        If the local clock is wrong, a certificate that is valid by the clocks of the peers is not reported as expired.
         """
 
         def offset(*seconds: float) -> dict[str, Any]:

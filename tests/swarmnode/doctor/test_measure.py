@@ -37,7 +37,7 @@ class MeasureTests(SynchronousTestCase):
         self.assertEqual([probe.error for probe in facts.known], ["refused"])
 
     def test_open_files(self) -> None:
-        """Settings that contain a key, and a store, are listed with their modes if other users can read them."""
+        """A settings file with a key, and a store, are each listed with the file mode if other users can read them."""
         settings = self.settings(store="a.sqlite")
         (self.folder / "a.sqlite").touch(mode=0o600)
         os.chmod(self.folder / "a.sqlite", 0o640)
@@ -47,7 +47,10 @@ class MeasureTests(SynchronousTestCase):
         )
 
     def test_store(self) -> None:
-        """A missing folder, and a folder at the path of the store, are reported; a store in memory has no file."""
+        """A missing folder of the store, and a folder at the store's path, are reported.
+
+        A store in memory has no file, so nothing is reported.
+        """
         missing = measure_facts(self.settings(store="nowhere/a.sqlite")).storage
         (self.folder / "b.sqlite").mkdir()
         folder = measure_facts(self.settings(store="b.sqlite")).storage

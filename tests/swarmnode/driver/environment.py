@@ -42,7 +42,7 @@ class ScriptedTerminal:
 
 
 class MemoryEnvironment:
-    """An environment in memory; each step calls ``pass_time``, for a robot that moves."""
+    """An environment in memory; each step of the clock calls ``pass_time``, which can move an emulated robot."""
 
     def __init__(self, clock: Clock, connector: Any, pass_time: Callable[[float], None] = lambda _: None) -> None:
         self.clock = clock

@@ -142,7 +142,7 @@ class DriverCommandTests(SynchronousTestCase):
         self.assertTrue(any("near 0.25 m" in line for line in lines))
 
     def test_drive_ends_at_rest_however_it_ends(self) -> None:
-        """The end of input and Ctrl-C end the drive like the key x: the robot stands still with disabled motors."""
+        """The end of the input, Ctrl-C and the key x all end the drive: the robot stands still with disabled motors."""
         for ending in ([(1.2, "")], [(1.2, "\x04")], []):
             began = self.clock.seconds()
             self.ground.keys = [(1.0, "w"), *ending]
@@ -210,7 +210,7 @@ class DriverCommandTests(SynchronousTestCase):
         self.assertEqual((code, "! no data within 8 s" in output), (1, True))
 
     def test_pilot_speaks_with_the_robots_own_token(self) -> None:
-        """A robot that accepted token 7 is driven with token 7: a higher token would lock out the team."""
+        """A robot that accepted token 7 is driven with token 7, because a higher token would lock out the team."""
         driver = create_driver("aibo", {"host": "dog1", "camera": False}, "dog1", self.clock, self.connector)
         driver.connect()
         self.turn(1.0)

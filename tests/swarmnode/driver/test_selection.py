@@ -92,7 +92,7 @@ class CatalogueTests(SynchronousTestCase):
         self.assertTrue(all(entry.is_ready for entry in list_kind_entries(lambda library: True)))
 
     def test_names_the_broken_kinds_of_others(self) -> None:
-        """A driver of another distribution is listed with its docstring; a driver that cannot be imported is broken."""
+        """A driver of another distribution is listed with its docstring, or as broken if it cannot be imported."""
         folder = Path(self.mktemp()).resolve()
         (folder / "odd-1.dist-info").mkdir(parents=True)
         (folder / "odd-1.dist-info" / "METADATA").write_text("Name: odd\nVersion: 1\n")
@@ -137,7 +137,7 @@ class RecordingConnectorTests(SynchronousTestCase):
             self.assertEqual(connector.connect(name, 10020, None), "tcp", name)
 
     def test_keeps_one_line_to_each_place(self) -> None:
-        """Repeated connections to the same robot do not use more and more memory."""
+        """Repeated connections to the same robot do not increase the memory use."""
         tcp = SimpleNamespace(connect=lambda host, port, client: SimpleNamespace(problem=client))
         connector = RecordingConnector(tcp, None)
         for number in range(1000):

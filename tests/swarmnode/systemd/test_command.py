@@ -49,7 +49,7 @@ class UnitTests(SynchronousTestCase):
             self.assertIn(line, lines)
 
     def test_what_the_settings_need_is_let_through(self) -> None:
-        """The unit grants access to exactly the device, the low port and the home folder that the settings require."""
+        """The unit grants access to a serial device, low ports and home folders only if the node needs them."""
         robot = unit(driver={"kind": "create2", "options": {"port": "/dev/ttyUSB0"}})
         low = unit({"roles": ["web"]}, web={"tls": "auto", "tls_port": 443})
         homes = [
@@ -202,7 +202,7 @@ class CommandTests(SynchronousTestCase):
         self.assertIn("journalctl -u swarm-node-dog1", complaint)
 
     def test_without_root_it_is_the_users_own(self) -> None:
-        """Without root rights the unit is a unit of the user's systemd, and uses the settings where they are."""
+        """Without root rights the unit is a unit of the user's systemd, and the settings file is not copied."""
         self.patch(os, "environ", {**os.environ, "XDG_CONFIG_HOME": "/home/ann/.config"})
         code, printed, _ = self.run_it("install", str(self.settings), uid=1000)
         self.assertEqual(code, 0)
