@@ -52,11 +52,12 @@ class SyncState:
     def is_enough(self, reached: list[int | None], away: int) -> bool:
         """Return whether the nodes in ``reached`` together have every record that a majority has.
 
-        ``reached`` contains the sync states of the nodes that were asked (None: no answer); ``away`` further nodes are
-        absent.  A node that was never synced has no records to send and is not counted in majorities.  If a synced node
-        answered, only synced nodes are counted, because the records of a stale node may be from a time with different
-        members.  A node that lost its records may have been one of the voters.  A new node is admitted by a majority of
-        the earlier nodes; otherwise each half of a partition could grow to a majority.
+        ``reached`` contains the sync states of the nodes that were asked (None: no answer); ``away`` is the number of
+        further nodes, which are absent.  A node that was never synced has no records to send and is not counted in
+        majorities.  If a synced node answered, only synced nodes are counted, because the records of a stale node may
+        be from a time with different members.  A node that lost its records may have been one of the voters.  A new
+        node is admitted by a majority of the earlier nodes; otherwise each half of a partition could grow to a
+        majority.
         """
         missing = reached.count(None) + away
         answered = reached.count(CURRENT) or reached.count(STALE)
