@@ -451,7 +451,7 @@ class Owner:
         self._transferring.add(contact.node_id)
         try:
             for page in split_pages(records):
-                with suppress(Refused):  # the store is full for one record; the next page may have smaller records
+                with suppress(Refused):  # there is no space for one record; the records of the next page may be smaller
                     await self._overlay.ask(contact, "store", [r.pack() for r in page], changes=True)
         finally:
             self._transferring.discard(contact.node_id)

@@ -292,7 +292,7 @@ class Replica:
         return acknowledged
 
     def _store_all(self, peer: Contact, records: list[Record], lives: Sequence[float | None]) -> list[int]:
-        """Store the valid records of ``records``; an owner with a full share does not affect other owners."""
+        """Store the valid ones of ``records``; a full share of one owner does not affect other owners."""
         replies = []
         for record, life in zip(records, lives, strict=True):
             try:

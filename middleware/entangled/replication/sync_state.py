@@ -27,7 +27,7 @@ class SyncState:
         self.is_synced = False
 
     def start(self, forgot: bool) -> None:
-        """Load the state of the earlier run; ``forgot``: its records were dropped, but other nodes rely on them."""
+        """Load the state from before the restart; ``forgot``: records were dropped, but other nodes rely on them."""
         noted = self._store.get_note(NOTE_NAME)
         is_bare = forgot or self._store.origin == "replaced" or self._store.corrupt_rows > 0
         self._has_lost = noted == LOST or (noted == SETTLED and is_bare)
