@@ -245,7 +245,7 @@ class Flow:
                 break
             self._mark_sent(message, number, now)
             picked.append((message, number))
-        # Each message requests its own receipts: for its last fragment in this burst, and for every fourth fragment.
+        # Each message requests receipts: for its last fragment in this burst, and for every fourth fragment.
         last = {message.key: place for place, (message, _) in enumerate(picked)}
         for place, (message, number) in enumerate(picked):
             self._send_sealed(message.make_fragment(number, message.requests_receipt() or place == last[message.key]))
