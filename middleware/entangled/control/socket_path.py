@@ -1,6 +1,6 @@
 """Location of the control sockets of this machine's nodes: one file per node, accessible only to its user.
 
-Any user may create a folder, a link or a socket in ``/tmp``, so node and client check who owns each of these.
+Any user may create a folder, a link or a socket in ``/tmp``, so node and client check the owner of each.
 """
 
 from __future__ import annotations

@@ -98,7 +98,7 @@ class TunnelConnections:
         return sent > 0
 
     def order_by_progress(self, now: float) -> list[TunnelConnection]:
-        """Return the open connections: with progress first, and then in the order of the bytes that they buffer."""
+        """Return the open connections: those with progress first, and of equals the one with fewer buffered bytes."""
         connections = [connection for connection in self.connections if connection.is_open]
         for connection in connections:
             self._measure_progress(connection, now)

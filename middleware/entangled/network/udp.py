@@ -202,7 +202,7 @@ class UdpNetwork:
         return _ask_route("2001:db8::1" if six else "192.0.2.1") or next(iter(own), "::1" if six else "127.0.0.1")
 
     def _find_route(self, host: str, ask: Callable[[], str]) -> str:
-        """Return a cached route to ``host``, calling ``ask`` again after ``ROUTE_CACHE_S``."""
+        """Return the route to ``host`` from the cache; if it is older than ``ROUTE_CACHE_S``, call ``ask`` again."""
         found, asked_at = self._routes.get(host, ("", -math.inf))
         now = self._reactor.seconds()
         if now - asked_at > ROUTE_CACHE_S:

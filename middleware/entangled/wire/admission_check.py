@@ -77,7 +77,7 @@ class Authority(NamedTuple):
     def is_final(self) -> bool:
         """Whether records that this authority does not allow can never become valid later.
 
-        With another refusal they may become valid with time, or by a later certificate.
+        If the refusal is not final, they may become valid with time, or by a later certificate.
         """
         return self.refusal in ("", REVOKED, ROLE)
 

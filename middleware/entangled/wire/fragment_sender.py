@@ -76,7 +76,7 @@ class FragmentedMessage:
         return self.acknowledged == (1 << self.count) - 1
 
     def next_fragment(self, limit: int | None = None) -> int | None:
-        """Return the next fragment to send, lost ones first; None if all are sent or the receiver's buffer is full."""
+        """Return the next fragment to send, lost ones first; None if all were sent or the receiver's buffer is full."""
         acknowledged, most = self.acknowledged, self.window_end if limit is None else limit
         while self._lost_fragments and acknowledged >> self._lost_fragments[0] & 1:
             self._lost_fragments.popleft()

@@ -303,7 +303,7 @@ class Peers:
     def has_live_session(self, peer: Peer) -> bool:
         """Return whether there is a session that a running peer has not forgotten yet.
 
-        In a wide network each node forgets the sessions with a silent peer without notification, at a time that the
+        In a large network, each node forgets the sessions with a silent peer without notification, at a time that the
         peer does not know.  Datagrams that the peer sends later in such a session are lost.
         """
         since = self._clock.seconds() - SESSION_SILENCE_S if self.is_large else float("-inf")
