@@ -405,7 +405,7 @@ class MembershipList:
                 self._remove(key)
 
     def _is_renewal_valid(self, renewal: Member, now: float) -> bool:
-        """Return whether a renewal applies: its signer is a bootstrap node, or was revoked and the renewal kept.
+        """Return whether a renewal applies: its signer is a bootstrap node, or its signer's revocation keeps it.
 
         Dates of a revoked signer prove nothing, because it can sign any date.  A member can renew itself only if no
         other node can.

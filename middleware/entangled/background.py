@@ -129,5 +129,5 @@ async def run_limited(width: int, work: Iterable[Coroutine[Any, Any, Any]]) -> N
 
 
 async def gather_first(needed: int, work: Iterable[Coroutine[Any, Any, Any]]) -> list[Any]:
-    """Return the first ``needed`` results of ``work``, or fewer if all coroutines have ended; the rest continues."""
+    """Return the first ``needed`` results of ``work``, or fewer if all coroutines have ended; others continue."""
     return await gather_until(lambda results: len(results) >= needed, work)

@@ -47,7 +47,7 @@ def use_monotonic_time() -> None:
 
 @implementer(IDelayedCall)
 class _HeapCall:
-    """A call of a ``HeapClock``; ``order`` is its position among simultaneous calls, 0 once it is over."""
+    """A call of a ``HeapClock``; ``order`` is its position among simultaneous calls, 0 if it ran or was cancelled."""
 
     __slots__ = ("time", "order", "_clock", "_function", "_arguments", "_keywords", "_is_cancelled")
 

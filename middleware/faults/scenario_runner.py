@@ -19,7 +19,8 @@ POLL_INTERVAL_S = 0.05
 DEVICE_TIMEOUT_S = 60.0
 """Seconds to wait for an executing device, or for the device with a given name."""
 SETTLE_S = 6.0
-"""Seconds after a fault for which a takeover is awaited; in this time the remaining devices may also end the task."""
+"""A takeover is awaited for this number of seconds after a fault; meanwhile, the remaining devices may also end the
+task."""
 ROLES_WITHOUT_ROBOT = {"bootstrap", "web"}
 
 

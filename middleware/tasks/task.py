@@ -358,7 +358,7 @@ def pack_done(result: Result, proof: bytes) -> bytes:
 
 
 def find_outcome(task: Task, records: Iterable[Record]) -> Result | None:
-    """Return the outcome of ``task``, or None if it has not ended; of several results, that with the highest token.
+    """Return the outcome of ``task``, or None if it has not ended; of several results, the one with the highest token.
 
     A result is valid if it was written by a node that may order tasks (``RESULT``).  A result of an agent (``DONE``) is
     valid if a majority of the quorum members has signed that the task ended under its fencing token.

@@ -204,7 +204,7 @@ class LossRate:
             self.rate = max(0.0, self.rate - self._gain)
 
     def _add_sample(self, lost: float) -> None:
-        self._gain = max(GAIN, self._gain / (1 + self._gain))  # a mean at first, later a moving average
+        self._gain = max(GAIN, self._gain / (1 + self._gain))  # at first a plain mean, later a moving average
         self.rate += (lost - self.rate) * self._gain
 
     @property
