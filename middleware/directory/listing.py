@@ -73,7 +73,7 @@ class Listing:
 
     @property
     def is_complete(self) -> bool:
-        """Whether every part was read, so no device that is listed at the depth of its neighbours is missing."""
+        """Whether every part was read, so that no device listed at the depth of its neighbours is missing."""
         return self.is_over and not self.missed
 
     @property

@@ -397,7 +397,7 @@ class EntangledNode:
         self.overlay.mark_rejecting(contact)
 
     def _handle_rejected_peer(self, contact: Contact, code: str) -> None:
-        if code not in (DOUBLED, SUPERSEDED):  # with these codes the other node with that identity stays a member
+        if code not in (DOUBLED, SUPERSEDED):  # with these codes, a second node with this identity stays a member
             self._drop_member(contact.public)
 
     def _drop_member(self, public: bytes) -> None:

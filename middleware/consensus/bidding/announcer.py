@@ -83,7 +83,7 @@ class Announcer:
         self._number = max(self._number, announcement.number)
 
     def make_due_announcement(self, last: Announcement | None, is_strict: bool, now: float) -> Announcement | None:
-        """Return the announcement that is due after ``last``; if ``is_strict``, also when only the standbys changed."""
+        """Return the announcement that is due after ``last``; ``is_strict``: also if only the standbys changed."""
         if now < self._announce_at:
             return None
         self._announce_at = math.inf

@@ -157,7 +157,7 @@ class NatTraversal:
         self._background.later(max(0.0, since + RELAY_AFTER_S - now), self._send_by_relay, opening)
         await self._ask_introducers(attempt)
         if not attempt.introducers and self._is_pending(opening):
-            await self._ask_introducers(attempt)  # other introducers, or the nodes that the first introducers suggested
+            await self._ask_introducers(attempt)  # ask more introducers, or the nodes that the first ones suggested
         if not self._is_pending(opening):
             return
         if not attempt.introducers:

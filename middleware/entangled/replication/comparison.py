@@ -94,7 +94,7 @@ class Comparison:
     # -- requests of peers ---------------------------------------------------------------------------------------------
 
     def _answer_digests(self, peer: Contact, bit: int, sync_state: int) -> list[object]:
-        """Answer DIGESTS: return each group's digest, the number of records for the peer only, and the lifetimes.
+        """Answer DIGESTS: return each group's digest and sum of lifetimes, and the number of records for the peer only.
 
         The two nodes also exchange their sync states.
         """

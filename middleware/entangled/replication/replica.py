@@ -181,7 +181,7 @@ class Replica:
         wants_synced: bool = False,
         digest: bytes = b"",
     ) -> list[object]:
-        """Answer FIND_VALUE: return a page of the records under ``key``, the next page's cursor or None, and its kind.
+        """Answer FIND_VALUE: return a page of records of ``key``, the next page's cursor or None, and the reply's kind.
 
         If this node has no records of the key, it also returns the contacts closest to the key; unless
         ``wants_synced``, it may return a cached copy.  If this node is not among the nodes closest to the key, its

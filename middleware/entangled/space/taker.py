@@ -260,7 +260,7 @@ class Taker:
         if winner != taker:
             self._slots.check_taken_note(tuple_id, winner)
             return False
-        with suppress(EntangledError):  # the node republishes the note later, and the council knows the taker
+        with suppress(EntangledError):  # harmless: the node republishes the note later, and the council knows the taker
             await self._slots.put_taken_note(tuple_id, winner)
         if wait is not None and wait.is_over:
             self._on_unwanted(claim.fields)

@@ -345,7 +345,7 @@ class Endpoint:
             self.on_forgotten(public)
 
     def reopen(self, contact: Contact) -> None:
-        """Open a session at the contact's address even if there is one at another address; the newest is used."""
+        """Open a session at the contact's address even if one at another address exists; the newest session is used."""
         if self.is_running:
             self._peers.open(self._peers.get_or_create(contact), contact.address)
 

@@ -280,7 +280,7 @@ class RequestHistory:
             account.finished[number] = entry
 
     def evict(self, public: bytes) -> list[Deferred[object]]:
-        """Forget the requests of a peer; return the running work, which the caller cancels."""
+        """Forget the requests of a peer; return the work that is still running, which the caller must cancel."""
         account = self._peers.pop(public, None)
         if account is None:
             return []

@@ -323,7 +323,7 @@ class Peers:
             self._delete_sessions(peer.sessions[:1])
             peer.sessions = peer.sessions[1:]
         if peer.handshake is not None and peer.handshake.punches and not is_carried:
-            self.close(peer.handshake)  # during hole punching, the peer's handshake succeeded before this node's own
+            self.close(peer.handshake)  # during hole punching, the handshake of the peer succeeded first
         if self._sweeper is None:
             self._sweep()
         self.on_established(session)
