@@ -22,7 +22,7 @@ _COMPACT_FROM = 64
 
 
 def find_boot_clock() -> Callable[[], float]:
-    """Return a clock of the seconds since the machine started, including suspension, independent of the wall clock.
+    """Return a clock of the seconds since the machine started, suspensions included; it ignores the wall clock.
 
     On systems without CLOCK_BOOTTIME it is ``time.monotonic``, which may stop during suspension.
     """

@@ -1,6 +1,7 @@
 """Run a scenario of faults on a team, and measure the time of each takeover.
 
-The team is a running team (``swarm faults``) or a simulated team in virtual time; the steps are the same for both.
+The team is a running team (``swarm faults``) or a simulated team in virtual time; the steps are the same for both kinds
+of team.
 """
 
 from __future__ import annotations

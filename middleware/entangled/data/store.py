@@ -28,8 +28,8 @@ from middleware.entangled.record import Record, Slot
 
 MAX_ROWS = 12_000
 """The maximum number of slots of a store.  A larger network needs more slots; each slot takes 1.2 KiB of memory in
-addition to the ``count_bytes`` of its record.  With this value and ``MAX_BYTES``, a full store adds 22 MiB to a node of
-40 MiB, which is the limit for a device with 64 MB."""
+addition to the ``count_bytes`` of its record.  With this value and ``MAX_BYTES``, a full store adds 22 MiB to the 40
+MiB of a node; together this is the limit for a device with 64 MB."""
 MAX_BYTES = 8 * 2**20
 """The maximum bytes of a store, counted by ``count_bytes``.  A higher value allows more large values, but uses more
 memory and flash."""

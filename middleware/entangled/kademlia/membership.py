@@ -44,8 +44,8 @@ MAX_FORMER_ADDRESSES = 32
 RETRY_INTERVAL_S = 4.0
 """The seconds before an absent member, or a member that is only known from other nodes, is tried again."""
 LARGE_REPORT_S = 60.0
-"""The seconds for which a notification that the network is large is valid.  A node without a further notification for
-this time starts to learn all members again."""
+"""The seconds for which a notification that the network is large is valid.  A node that gets no further notification
+during this time starts to learn all members again."""
 NEWCOMER_DELAY_S = 0.02
 """The seconds that a newcomer waits before it contacts the next few unknown members, so as not to delay the first
 reads.  A random delay of up to the same length is added."""

@@ -42,8 +42,8 @@ ACCEPT_TIMEOUT_S = 8.0
 DIAL_TIMEOUT_S = 12.0
 """The same time in seconds for the dialling side; it is longer, because the connection may go through a proxy."""
 UNANSWERED_TIMEOUT_S = 10.0
-"""The time in seconds without an answer after which a client is considered a non-member, because the wire protocol
-answers only members."""
+"""If this node has sent no answer to a client within this time in seconds, the client is considered a non-member,
+because the wire protocol answers only members."""
 IDLE_TIMEOUT_S = 60.0
 """The time in seconds without traffic after which the dialling side closes a tunnel."""
 MAX_TOTAL_CONNECTIONS = 256

@@ -86,7 +86,7 @@ class Tally:
 
 
 class Round:
-    """One request to all members; fires ``outcome`` with this round as soon as each of its ``tallies`` is decided.
+    """One request to all members; ``outcome`` fires with this round as soon as each of its ``tallies`` is decided.
 
     ``ask`` sends the request to the member at a place.  If a member replies that another proposer's lease ends within
     ``short`` seconds, the request is repeated at the end of that lease, or earlier if the end is far off.  ``outcome``

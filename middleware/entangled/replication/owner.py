@@ -392,8 +392,8 @@ class Owner:
     def _send_renewals(self) -> bool:
         """Renew the own leases that are due: send each replica its lease and the digest of its records.
 
-        If a replica has records with several lease durations, it gets the shortest duration.  Returns whether there are
-        any leases.
+        If a replica has records with different lease durations, it gets the shortest duration.  Returns whether there
+        are any leases.
         """
         now = self._clock.seconds()
         due: set[bytes] = set()
