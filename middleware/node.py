@@ -60,7 +60,7 @@ if TYPE_CHECKING:
 CAMERA = "camera"
 LEASE_VERBS = ("prepare", "propose", "release", "close", "cancel", "change", "install", "freed")
 PLACE_CHECK_INTERVAL_S = 0.3
-"""Seconds between two checks of a new node for devices with the same number in the order of joining."""
+"""A new node checks at this interval in seconds whether other devices have the same number in the order of joining."""
 MAX_PLACE_CHECKS = 10
 FIGURES_INTERVAL_S = 2.0
 """Seconds between two updates of the node's network figures in its presence; one minute in a large team."""
@@ -162,7 +162,7 @@ class SwarmNode(Service):
         await self.entangled.join(self._known_nodes)
         others = await self._find_others()
         depth = await self.directory.choose_initial_depth()
-        if depth:  # at this depth the neighbourhood contains different devices
+        if depth:  # at the new depth, the neighbourhood contains different devices
             others = await self._find_others()
         previous = [d.joined for d in others if d.uuid == self.uuid]
         self.presence.device = replace(self._with_address(self.presence.device), depth=depth)
@@ -285,7 +285,7 @@ class SwarmNode(Service):
 
     async def submit(self, task: Task) -> Task:
         """Publish ``task`` with its council, the nodes that are now closest to its key; raise ``UnknownStrategy``."""
-        if not is_deployed(task.strategy):  # only nodes with the deployed module can check it
+        if not is_deployed(task.strategy):  # a deployed strategy can be checked only by nodes that have the module
             find_import_path(task.strategy)
         task = await self.council_manager.choose_council(task)
         await self.entangled.put(TASKS, task.task_id, task.pack(), "team")
@@ -308,8 +308,8 @@ class SwarmNode(Service):
     ) -> Group:
         """Take part in a task; bid for it if the task has a council.
 
-        If the task has a council, in a large team only its reporters (``reporters``) write records.  A task that
-        belongs to a group is an exception: its assignment needs the records of all participants.
+        If the task has a council, in a large team only its reporters (``reporters``) write records.  For a task that
+        belongs to a group, all participants write records, because its assignment needs the records of all.
         """
         from middleware.consensus.bidding.reporters import make_reporters
 

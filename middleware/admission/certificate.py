@@ -9,12 +9,12 @@ A node sends its certificate in the handshake of a session.  A certificate is on
   signature of the bootstrap node, and ``grant`` is the operator's grant to that node with the role ``bootstrap``.  So
   neither a bootstrap node alone nor the holder of a leaked code alone can admit a member.  * ``[2, name, not before,
   not after, signature, gateway, pass]``: a guest, such as a visitor's phone.  A member with the role ``gateway`` signs
-  it, for at most a day; it becomes invalid when the gateway's own certificate ``pass`` does.  * ``[3, content, not
-  before, not after, signature, grant]``: a renewal of format 0 or 1.  ``content`` has the fields that the operator
-  signed, ``[grant]`` or ``[invite, wish, proof, name, admitter]``; the bootstrap node adds its ``signature`` and its
-  ``grant``.  Name and roles follow from ``content``, so a renewal changes only the dates.  Only certificates that the
-  operator issued for ``DEFAULT_LIFE_S`` or longer are renewed, and only by bootstrap nodes that have such a
-  certificate.
+  the certificate of the guest, for at most a day.  This certificate becomes invalid when the gateway's own certificate
+  ``pass`` becomes invalid.  * ``[3, content, not before, not after, signature, grant]``: a renewal of format 0 or 1.
+  ``content`` has the fields that the operator signed, ``[grant]`` or ``[invite, wish, proof, name, admitter]``; the
+  bootstrap node adds its ``signature`` and its ``grant``.  The name and the roles are in ``content``, so a renewal
+  changes only the dates.  Only certificates that the operator issued for ``DEFAULT_LIFE_S`` or longer are renewed, and
+  only by bootstrap nodes that have such a certificate.
 """
 
 from __future__ import annotations
@@ -254,7 +254,7 @@ def _verify_invited(operator: bytes, public: bytes, content: list[Any]) -> Membe
 def _verify_invitation(
     operator: bytes, public: bytes, packed: Any, requested_name: Any, signature: Any, name: Any
 ) -> Invite:
-    """Return the verified invitation, by which ``public`` joined with ``name``."""
+    """Return the invitation by which ``public`` joined with ``name``, after verification."""
     invite = open_statement(operator, packed)
     if not isinstance(invite, Invite):
         raise Malformed("the certificate does not begin with an invitation")

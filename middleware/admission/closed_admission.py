@@ -50,7 +50,7 @@ def start_incarnation(store: Store, wall: float, rng: random.Random) -> Incarnat
         last = int(store.get_note(INCARNATION_NOTE) or b"0")
     except ValueError:  # damaged file
         last = 0
-    # In milliseconds: a guest can leave and return within a second, and stores nothing in between.
+    # The time is in milliseconds, because a guest can leave and return within a second, and stores nothing in between.
     number = next_incarnation(max(0, last), wall * 1000.0)
     store.set_note(INCARNATION_NOTE, b"%d" % number)
     return Incarnation(number, rng.randbytes(NONCE_BYTES))
@@ -83,7 +83,7 @@ class ClosedAdmission:
         self._session_members: OrderedDict[bytes, Member] = OrderedDict()
         self._unlisted_certificates: dict[
             bytes, bytes
-        ] = {}  # certificates of members in ``_session_members`` that are not on the list
+        ] = {}  # certificates of the members in ``_session_members`` that are not on the membership list
         self._authorities: dict[bytes, Authority] = {}
         self._cached_at = (b"", 0.0)
 
@@ -190,7 +190,7 @@ class ClosedAdmission:
         return found
 
     def find_certificate(self, owner: bytes) -> bytes:
-        """Return an owner's certificate, the latest grant or the one that it sent; empty if unknown."""
+        """Return an owner's certificate: the latest grant, or the certificate that the owner sent; empty if unknown."""
         if owner == self._own_member.public:
             return self.own_pass
         now, grant, admission = (

@@ -1,7 +1,8 @@
 """Gossip of the membership list: epidemic push of new entries, and periodic anti-entropy.
 
 A node that learns a new entry sends it to a few random members, which do the same.  Every few seconds each member
-compares its list with another member's, so members that were partitioned, asleep or missed by the push catch up.
+compares its list with the list of another member.  So members that were partitioned or asleep, or that the push did not
+reach, catch up.
 """
 
 from __future__ import annotations
@@ -93,7 +94,8 @@ class Gossip:
                 self._log.warn("{error}", error=error)
             self._is_full = True
         finally:
-            # Many new entries at once occur at a newcomer only; otherwise the others catch up by comparison.
+            # Only a newcomer gets many new entries at the same time; in any other case, the remaining members catch up
+            # by comparison.
             if len(fresh) <= MAX_PUSHED_ENTRIES:
                 self._push(fresh, but)
 

@@ -25,7 +25,8 @@ from middleware.entangled.network.network import Address, Network
 JOIN_TIMEOUT_S = 20.0
 """Seconds until a newcomer gives up."""
 FIRST_RETRY_S, RETRY_GROWTH, TRIES_PER_ADDRESS = 0.25, 1.6, 4
-"""Seconds until a request is repeated, growth factor of that delay, and requests per address in a row."""
+"""Seconds until a request is repeated, growth factor of that delay, and number of successive requests to one
+address."""
 FINAL_REFUSALS = ("used", "expired", "early", "revoked", "name", "foreign")
 """Refusals that every bootstrap node would give."""
 MAX_ADDRESSES = 64
@@ -111,7 +112,7 @@ class JoinClient:
             self._try_next(reply.content, source)
 
     def _try_next(self, code: str, source: Address) -> None:
-        """Try the next address, because that node may admit the newcomer; this address is tried again later."""
+        """Try the next address, because its node may admit the newcomer; the current address is tried again later."""
         self._last_refusal = code
         if source == self._addresses[self._address_index % len(self._addresses)]:
             self._select_next_address()

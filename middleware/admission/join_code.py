@@ -2,18 +2,18 @@
 
 A code contains a secret of 75 bits, 20 bits of the fingerprint of the operator's public key, and 5 check bits.  Two
 keys are derived from it: the invitation's key pair, whose public half every member knows, and the key of the
-invitation's terms, which only the operator and the newcomer can derive.  The alphabet is Crockford's base 32 without
-I, L, O and U; I, L and O are read as the digits that they resemble.  The check is a weighted sum over GF(32) with a
-different weight for each position: it detects every single wrong character and every transposition of two before
-anything is sent.
+invitation's terms, which only the operator and the newcomer can derive.  The alphabet is Crockford's base 32 without I,
+L, O and U; I, L and O are read as the digits that they resemble.  The check is a weighted sum over GF(32) with a
+different weight for each position: so it detects every single wrong character, and every transposition of two
+characters, before anything is sent.
 
 A newcomer does not know the operator's key, and the node that answers it can be a hostile member, which knows the
 invitation's public key and the team's secrets.  Therefore the operator encrypts its public key, the team's name and the
 settings for newcomers under a key that only the code yields (XChaCha20-Poly1305).  The encrypted terms are distributed
 with the membership list; members can neither read nor forge them.
 
-A password-authenticated key exchange, as in magic-wormhole, needs the operator online when a newcomer joins; here the
-operator's key is on no node.  Members can search for the code offline, hence its 75 bits.
+A password-authenticated key exchange, as in magic-wormhole, would need the operator's key online when a newcomer joins,
+but here no node has this key.  Members can search for the code offline; therefore its secret has 75 bits.
 """
 
 from __future__ import annotations

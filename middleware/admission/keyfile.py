@@ -49,7 +49,7 @@ def read_bytes(path: Path) -> bytes:
 def write(path: Path, content: Mapping[str, Any], is_new: bool = False) -> None:
     """Replace the file at ``path`` with ``content``, or create it if ``is_new``; raises ``BadKeyFile``.
 
-    A concurrent reader, or a reader after a power failure, gets either the old or the new content.
+    A concurrent read, or a read after a power failure, returns either the old or the new content.
     """
     fresh = path.with_name(f".{path.name}.{os.getpid()}")
     if is_new and path.exists():

@@ -72,7 +72,7 @@ class SignedCertificate(Entry):
 
     @property
     def kept_until(self) -> int:
-        """The time from which the operator can no longer renew it."""
+        """The time from which the operator can no longer renew the certificate."""
         return compute_retention_end(self.member.not_after, self.member.life)
 
 
@@ -142,7 +142,7 @@ class MembershipList:
         self._by_id: dict[bytes, bytes] = {}
         self.invalidated: list[bytes] = []
         """Keys of the members whose admission the last revocation invalidated."""
-        self._users: dict[bytes, Counter[bytes]] = {}  # keys of the members that joined by each invitation
+        self._users: dict[bytes, Counter[bytes]] = {}  # for each invitation, the keys of the members that joined by it
         self._digest = 0
         self._bytes = 0
 
@@ -313,7 +313,7 @@ class MembershipList:
         return None if renewal is None else self.update_member(renewal.member, now)
 
     def find_best_certificate(self, member: Member, certificate: bytes, now: float) -> bytes:
-        """Return the best certificate of ``member``, the one that ends last; ``certificate`` is its known one."""
+        """Return the certificate of ``member`` that ends last; ``certificate`` is its certificate as known so far."""
         known, renewal, grant = (
             self.update_member(member, now),
             self.find_renewal(member.public),
@@ -343,8 +343,9 @@ class MembershipList:
     def is_last_bootstrap(self, public: bytes, since: float, now: float) -> bool:
         """Return whether no other bootstrap node can renew certificates; the last one renews itself.
 
-        A bootstrap node that the operator named after ``since`` does not count, nor does one that ends within two
-        ``MIN_RENEWAL_S``: bootstrap nodes renew each other long before that, so it is offline.
+        A bootstrap node that the operator named after ``since`` does not count.  A bootstrap node whose certificate
+        ends within two ``MIN_RENEWAL_S`` does not count either: it must be offline, because bootstrap nodes renew each
+        other long before that.
         """
         publics = {each.public for each in self._list_kind(Grant)}
         publics |= {each.member.public for each in self._list_kind(Renewal)}
@@ -404,7 +405,7 @@ class MembershipList:
                 self._remove(key)
 
     def _is_renewal_valid(self, renewal: Member, now: float) -> bool:
-        """Return whether a renewal applies: its signer is a bootstrap node, or was revoked and the renewal kept.
+        """Return whether a renewal applies: its signer is a bootstrap node, or its signer's revocation keeps it.
 
         Dates of a revoked signer prove nothing, because it can sign any date.  A member can renew itself only if no
         other node can.
@@ -419,7 +420,7 @@ class MembershipList:
         return renewal.not_before <= now + MAX_CLOCK_SKEW_S
 
     def _is_invalid(self, entry: Entry, now: float) -> bool:
-        """Return whether an admission or a renewal is invalid at any time."""
+        """Return whether an admission or a renewal is permanently invalid."""
         if not isinstance(entry, SignedCertificate):
             return False
         member = entry.member

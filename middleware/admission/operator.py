@@ -105,9 +105,9 @@ class Operator:
     ) -> bytes:
         """Revoke the key of a member or of an invitation.
 
-        ``members`` are the public keys of members admitted by a revoked bootstrap node that stay members; the others
-        are revoked with it.  ``renewals`` are its renewals that stay valid, as pairs of key and end.  Raises
-        ``ValueError`` if there are too many.
+        If the key is a bootstrap node's, ``members`` are the public keys of the members that it admitted and that stay
+        members; all other members that it admitted are revoked too.  ``renewals`` are the renewals by this node that
+        stay valid, as pairs of key and end.  Raises ``ValueError`` if there are too many.
         """
         ids = (*(member_id(each) for each in members), *(renewal_id(*each) for each in renewals))
         if len(ids) > MAX_KEPT:

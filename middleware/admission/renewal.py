@@ -102,7 +102,7 @@ class Renewer:
 
     @staticmethod
     def _is_due(member: Member, latest: int, now: float) -> bool:
-        """Return whether little of the certificate is left, or a bootstrap node's ends well before ``latest``."""
+        """Return whether the certificate ends soon, or is a bootstrap node's and ends well before ``latest``."""
         end = now + member.life
         if end < member.not_after + MIN_RENEWAL_S:
             return False

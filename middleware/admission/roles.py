@@ -146,8 +146,8 @@ NAMESPACES: Mapping[str, Namespace] = {
     ),
     OTHER: Namespace(WRITING, REST, "tuples, and other records of programs in the DHT", ("group/7", "anything")),
 }
-"""Each kind of record with the roles that may write it.  Nodes neither store nor return nor accept a record whose
-owner's current certificate does not permit it."""
+"""Each kind of record with the roles that may write it.  If the current certificate of a record's owner does not permit
+the record, nodes neither accept, store nor return it."""
 
 KINDS: Mapping[str, frozenset[str]] = {kind: namespace.roles for kind, namespace in NAMESPACES.items()}
 _BY_KEY = {hash_key(kind): kind for kind, namespace in NAMESPACES.items() if namespace.by == BY_KEY}

@@ -1,9 +1,9 @@
 """Statements that an operator signs: grants, invitations, revocations, and the team's secrets.
 
 A statement is packed as one msgpack array, ``[kind, field, ..., signature]``.  The Ed25519 signature covers
-``"swarm-team-1 "``, the operator's public key, and the array without the signature, so a signature for another team or
-another purpose is not valid.  Times are whole seconds of the wall clock, because statements outlive every process.
-``open_statement`` is total: for any input it returns a valid statement or raises ``Malformed`` or ``Forged``.
+``"swarm-team-1 "``, the operator's public key, and the array without the signature, so a signature for a different team
+or a different purpose is not valid.  Times are whole seconds of the wall clock, because statements outlive every
+process.  ``open_statement`` is total: for any input it returns a valid statement or raises ``Malformed`` or ``Forged``.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ MAX_STATEMENT_BYTES = 65_536
 MAX_TERMS_BYTES = 320
 """Maximum size in bytes of the encrypted terms of an invitation: they have to fit into a join reply."""
 MAX_SECRET_RECIPIENTS = 500
-"""Maximum number of members for which one statement contains the team's secret; others request the secret from a
-member."""
+"""Maximum number of members for which one statement contains the team's secret; further members request it from a
+member that has it."""
 MAX_LIFE_S = 10 * 365 * 86_400
 """Maximum validity of a certificate, in seconds."""
 INVITATION_REMEMBERED_S = 7 * 86_400

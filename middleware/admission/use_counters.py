@@ -27,7 +27,7 @@ class UseCounters:
         self._space = TupleSpace(node, clock, rng, SPACE_NAME)
 
     def issue(self, invite: Invite) -> Deferred[list[None]]:
-        """Put the uses of ``invite``; fires when a majority stored them, fails with a ``TransientError``."""
+        """Put one tuple per use of ``invite``; fires when a majority stored them, fails with a ``TransientError``."""
         name = invitation_id(invite.public)
         puts = [self._space.put((name, number)) for number in range(invite.uses)]
         return gatherResults(puts, consumeErrors=True).addErrback(_unwrap_first_error)

@@ -97,9 +97,9 @@ class NodeSettings:
     precedence."""
 
     presence_lease: Annotated[float, Meta(ge=0.1, le=60.0), Unit("seconds")] = 1.0
-    """Seconds until other nodes consider a silent device lost.  A shorter time detects a loss sooner, but mistakes a
-    slow radio for a loss.  A longer time needs fewer datagrams: the node sends each replica three renewals per
-    lease."""
+    """Seconds until other nodes consider a silent device lost.  With a shorter time, a loss is detected sooner, but a
+    slow radio may be mistaken for a loss.  With a longer time, the node sends fewer datagrams: three renewals per lease
+    to each replica."""
 
     position: setting.Position = field(default_factory=dict)
     """Position of the device on the page's map: ``x`` and ``y`` in metres and ``heading`` in radians, or ``lat`` and
@@ -188,8 +188,8 @@ class WebSettings:
     code."""
 
     names: setting.HostNames = ()
-    """Additional host names by which browsers may open the page, at most 8.  The addresses of this machine, its host
-    name (also with ``.local`` and ``.lan``) and the node's name are always accepted."""
+    """Additional host names by which browsers may open the page, at most 8.  The page can always be opened by the
+    addresses of this machine, by its host name (also with ``.local`` and ``.lan``) and by the node's name."""
 
     sign_in: bool = True
     """False: no sign-in; anyone who opens the page is an operator.  Allowed only if ``host`` is a loopback address."""

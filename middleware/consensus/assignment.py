@@ -30,7 +30,7 @@ class MultiTaskStrategy(Nearest):
         return found[0] if found else super().find(contacts)
 
     def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
-        """Return all valid reports in ``a`` and ``b``, because each may affect the assignment."""
+        """Return all valid reports in ``a`` and ``b``, because each report may affect the assignment."""
         return standing((*a, *b))
 
     def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
@@ -54,7 +54,7 @@ def to_millionths(cost: float) -> int:
 
 
 def find_capacities(contacts: Iterable[Report]) -> dict[str, int]:
-    """Return the number of tasks that each agent accepts, the lowest in its reports."""
+    """Return the number of tasks that each agent accepts: the lowest capacity in the reports of the agent."""
     most: dict[str, int] = {}
     for report in contacts:
         most[report.agent] = min(report.capacity, most.get(report.agent, report.capacity))

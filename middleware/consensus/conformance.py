@@ -183,7 +183,7 @@ def check_hostile(make: Factory) -> None:
 
 
 def check_improves(make: Factory) -> None:
-    """Only an offer that is better by more than the hysteresis takes over, so that the task does not oscillate."""
+    """An agent takes over only if its offer is better by more than the hysteresis, so the task does not oscillate."""
     strategy = make()
     for rng, contacts in _make_teams():
         a, b = contacts[0], replace(make_team(rng)[0], agent="other")

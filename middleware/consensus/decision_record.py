@@ -58,7 +58,7 @@ class DecisionRecord:
     - ``hysteresis``: a text about the effect of the hysteresis on the agent that acted before
     - ``digest``: the digest of the reports, as this agent computed it
     - ``token``: the fencing token of the lease if this agent holds it, otherwise 0
-    - ``participants``, ``reported``: the number of participants, and the number of participants with a report
+    - ``participants``, ``reported``: the number of all participants, and of those with a report
     - ``reports``: the reports, the best first
     - ``silent``: names of participants without a report
     - ``value``, ``choice``: the agreed number or place, or the option that won the vote; empty if there was no such

@@ -1,6 +1,7 @@
 """The names with which tasks refer to deployed modules, and the lookup of the modules' factories; pure.
 
-Nodes that do not allow deployment also have to resolve these names, without importing ``middleware.deployment``.
+This module does not import ``middleware.deployment``, because nodes that do not allow deployment also have to resolve
+these names.
 """
 
 from __future__ import annotations

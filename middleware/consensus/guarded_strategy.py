@@ -49,8 +49,8 @@ class StrategyLost(StrategyError):
 class GuardedStrategy:
     """Calls a strategy, and uses ``nearest`` instead if the strategy fails.
 
-    If ``twice``, which is for third-party strategies, ``find`` is called again with the reports in a different order,
-    and both results must be equal.
+    ``twice`` is for third-party strategies: ``find`` is then called a second time with the reports in a different
+    order, and both results must be equal.
     """
 
     log = Logger()

@@ -50,7 +50,7 @@ def make_view(strategy: object) -> ReportView:
 # Numbers are converted to float, because 1 and 1.0 are equal but have different digests.
 _READERS: dict[str, Any] = {
     "battery": lambda member: float(member.battery),
-    "load": lambda member: float(max(0, member.load - 1)),  # the number of tasks in addition to this one
+    "load": lambda member: float(max(0, member.load - 1)),  # the load is the number of tasks in addition to this one
     "value": lambda member: tuple(map(float, member.value)),
     "choice": lambda member: member.choice,
     "weight": lambda member: float(member.weight),

@@ -267,7 +267,7 @@ def find_import_path(name: str, dotted: bool = False) -> str:
     """Return the import path ``module:Class`` of a strategy without importing it; raises ``UnknownStrategy``."""
     target = name if dotted and ":" in name else BUILT_IN.get(name)
     if target is None:
-        from importlib.metadata import entry_points  # slow to import, and rarely needed
+        from importlib.metadata import entry_points  # this import is slow and rarely needed
 
         found = {point.name: point.value for point in entry_points(group=ENTRY_POINT_GROUP)}
         target = found.get(name)

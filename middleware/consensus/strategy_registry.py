@@ -12,8 +12,8 @@ class StrategyRegistry:
     """The strategies of one node, by name.
 
     A third-party strategy runs in a separate process, so all tasks and auctions share one instance until ``stop``.  Its
-    losses (``guarded_strategy.MAX_LOSSES``) are therefore counted over all tasks, because each loss blocks the whole
-    node.  A strategy that has reached the limit is not called again until the node restarts.
+    failed calls (limit: ``guarded_strategy.MAX_LOSSES``) are counted over all tasks, because each of them blocks the
+    whole node.  A strategy that has reached the limit is not called again until the node restarts.
     """
 
     def __init__(self) -> None:

@@ -36,7 +36,7 @@ def main() -> None:
     import_path, limit_s = sys.argv[1], float(sys.argv[2])
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
     out = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # keep the output of the strategy apart from results
+    os.dup2(2, 1)  # keep the output of the strategy separate from the results
     pipe = sys.stdin.buffer
     signal.signal(
         signal.SIGALRM, signal.SIG_DFL

@@ -38,7 +38,7 @@ ALLOWED_CALLS = (
     *("futex", "set_robust_list", "rseq", "sched_yield", "getpid", "getrandom"),
     *("clock_gettime", "gettimeofday", "nanosleep", "clock_nanosleep", "exit", "exit_group"),
 )
-"""System calls that a module may make, on files that are already open; all others fail with EPERM."""
+"""System calls that a module may make, on files that are already open; all other system calls fail with EPERM."""
 _NUMBERS: dict[str, tuple[int, int, tuple[int, ...]]] = {
     # machine: architecture for seccomp, number of the system call seccomp, numbers of CALLS in their order
     "x86_64": (

@@ -37,7 +37,7 @@ from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record, hash_key, parse_record
 
 RETRY_S = 2.0
-"""Seconds after which a source that no node could send is requested again."""
+"""If no node could send the source of a module, the source is requested again after this number of seconds."""
 WATCH_INTERVAL_S = 1.0
 """Seconds between two checks of authors and processes."""
 START_CHECK_INTERVAL_S = 0.05
@@ -50,7 +50,7 @@ MAX_CHECKED_MANIFESTS = 256
 """Maximum number of manifests that are remembered as checked; a forgotten manifest is checked and reported again."""
 MAX_AUTHOR_CHARACTERS = 16
 CONFINED = "seccomp"
-"""If this limit is not in effect, the device reports the module as not confined."""
+"""The name of a limit (``confinement``) without which the device reports a module as not confined."""
 
 Later = Callable[..., object]
 
@@ -132,7 +132,7 @@ class Deployment:
             else:
                 found.setdefault(manifest.name, []).append(_Candidate(manifest, record, source))
         for name in sorted(found):
-            # The newest one that loads; the previous one is used if the newest does not load.
+            # Use the newest version that loads: if the newest version does not load, use the previous version.
             self._start(sorted(found[name], key=lambda each: each.manifest.rank, reverse=True), is_new=False)
         self._report()
         self._later(WATCH_INTERVAL_S, self._watch)

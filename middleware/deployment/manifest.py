@@ -1,4 +1,4 @@
-"""A manifest is an operator's signed description of one module; this module also defines their order.  Pure.
+"""Manifests: an operator's signed descriptions of pushed modules, and the order of manifests with one name.  Pure.
 
 A manifest is a small team record of the operator, with the name of the module.  The source is stored under a separate
 key derived from its digest, so a node that trusts the manifest can accept the source from any node.
@@ -93,7 +93,7 @@ def manifests_key() -> bytes:
 
 
 def find_newest(manifests: Iterable[Manifest]) -> Manifest | None:
-    """Return the valid manifest of several with the same name."""
+    """Return the one manifest that is valid among several with the same name."""
     return max(manifests, key=lambda manifest: (manifest.rank, manifest.digest), default=None)
 
 

@@ -57,7 +57,7 @@ class StrategyKind:
         return make()
 
     def describe_instance(self, thing: object) -> dict[str, Any]:
-        """Return the fields of a report that the strategy reads, apart from the cost."""
+        """Return the report fields that the strategy reads, in addition to the cost."""
         return {"reads": list(find_read_fields(thing))}
 
     def call(self, thing: object, method: str, arguments: list[Any]) -> object:

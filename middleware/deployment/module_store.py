@@ -1,4 +1,4 @@
-"""Storage of accepted modules: one file for each, written atomically."""
+"""Storage of accepted modules: one file for each module, written atomically."""
 
 from __future__ import annotations
 

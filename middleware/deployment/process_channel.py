@@ -26,7 +26,7 @@ READ_BYTES = 64 * 1024
 MAX_READ_BYTES = 1024 * 1024
 """Maximum number of bytes per read."""
 ENVIRONMENT = {
-    # Give sets the same order on every machine, and keep numeric libraries from starting threads.
+    # These variables give sets the same order on every machine, and keep numeric libraries from starting threads.
     "PYTHONHASHSEED": "0",
     "OPENBLAS_NUM_THREADS": "1",
     "OMP_NUM_THREADS": "1",

@@ -1,8 +1,8 @@
 """Start, call, supervise and end the process of one pushed module.
 
 The node never waits for a behaviour: it sends a request and polls for the reply.  It waits for a strategy for at most
-``DEADLINE_S``.  A process that is late, ends, or sends an unexpected reply is killed.  The next request restarts the
-process, unless it was lost ``MAX_LOSSES`` times.
+``DEADLINE_S``.  A process that is late or sends an unexpected reply is killed.  After a process was killed or has
+ended, the next request starts a new one, unless this has happened ``MAX_LOSSES`` times.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Comparison of the agents' decision records for one task.  Pure.
 
-The result lists the agents that agree, and how each other agent differs: in its winner, its strategy or its reports.
+The result lists the agents that agree.  For each agent that does not agree, it lists the difference: a different
+winner, a different strategy or different reports.
 """
 
 from __future__ import annotations
@@ -29,11 +30,11 @@ class EpochExplanation:
     """The result of one epoch: the agents' decision records compared.
 
     ``winner`` is the uuid of the agent that most agents chose (the lowest uuid if there is a tie), and ``chosen`` is
-    its name.  ``agree`` are the names of the agents that chose it.  ``of`` is the number of participants; in a large
-    group, the number of agents that have to publish their decision.  ``differ`` lists the agents whose winner, strategy
-    or reports differ from the values of most agents in ``agree``.  ``token`` is the winner's fencing token, 0 if
-    unknown, and ``agreed`` is the number, place or option that the strategy agreed on.  The other fields are from the
-    records of the majority.
+    its name.  ``agree`` are the names of the agents that chose this winner.  ``of`` is the number of agents that have
+    to publish their decision: all participants, or in a large group some of them.  ``differ`` lists the agents whose
+    winner, strategy or reports differ from the values of most agents in ``agree``.  ``token`` is the winner's fencing
+    token, 0 if unknown, and ``agreed`` is the number, place or option that the strategy agreed on.  The other fields
+    are from the records of the majority.
     """
 
     epoch: int

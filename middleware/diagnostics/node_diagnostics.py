@@ -1,6 +1,6 @@
 """Diagnostics of a node for other nodes: store contents, contacts, traffic and link quality.
 
-Only the paths to peers are measured when a node requests them; all other data exists anyway.
+A request starts a measurement of the paths to peers; all other data is already present in the node.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ INVENTORY_METHOD, NETWORK_METHOD, LINKS_METHOD = "device.inventory", "device.net
 MAX_RECORDS = 16
 """Maximum number of records that are listed."""
 MAX_CONTACTS = 64
-"""Maximum number of contacts that are listed, those with the most recent datagram first."""
+"""Maximum number of contacts that are listed; the contacts with the most recent datagrams come first."""
 MAX_REFUSALS = 16
 """Maximum number of refusals that are listed, the newest first."""
 MAX_MEMBERS = 256
 ENDING_S = 14 * 86_400.0
-"""Seconds before the end of a certificate during which it is reported as about to expire."""
+"""A certificate that ends within this number of seconds is reported as about to expire."""
 STOPS_KEY = hash_key("halt")
 
 

@@ -31,9 +31,9 @@ from middleware.entangled.replication.reader import ReadConsistency
 CONCURRENT_READS = 8
 """Number of keys that one listing reads concurrently."""
 PLACEMENT_STEPS, PLACEMENT_STEP_S = 50, 0.1
-"""Maximum number of steps for which a new node waits until it knows its neighbours, and the seconds of one step."""
+"""A new node waits at most this number of steps until it knows its neighbours; each step takes the given seconds."""
 PARTIAL_SEARCH_LEVELS = 2
-"""Number of levels above its own depth at which a device starts a partial search, which then reads about four keys."""
+"""A device starts a partial search this number of levels above its own depth, and so reads about four keys."""
 
 Matches = Callable[[Device], bool]
 
@@ -117,7 +117,7 @@ class Directory:
     # --------------------------------------------------------------------------------------------------
 
     async def read_neighbourhood(self) -> list[Record]:
-        """Return the records of this device and its neighbours, which are all devices if the directory is not split."""
+        """Return the records of this device and its neighbours, or of all devices if the directory is not split."""
         place = compute_prefix(self._own_id, max(0, self.depth - 1))
         records = await self.entangled.get(place.key)
         return [record for _, record in select_listed(place.key, records)] if self.depth else records
@@ -131,8 +131,8 @@ class Directory:
     ) -> Listing:
         """List all devices, or those with the prefix ``under``; call ``on_found`` after each batch of reads.
 
-        A ``fast`` read costs a fifth of a majority read, but may miss recent changes.  This method never fails: keys
-        that could not be read are in ``Listing.missed``.  ``pause`` is the time in seconds between two batches of
+        This method never fails: keys that could not be read are in ``Listing.missed``.  With ``fast``, a read costs a
+        fifth of a majority read, but may miss recent changes.  ``pause`` is the time in seconds between two batches of
         reads.
         """
         listing = Listing(max(0, self.depth - 1), under)
@@ -143,7 +143,7 @@ class Directory:
             except EntangledError:
                 pass
             try:
-                # If there is no majority of replicas, use the records of any replica, but mark this part as incomplete.
+                # If no majority of replicas answers, use the records of any replica, but mark this part as incomplete.
                 listing.add_records(place, await self.entangled.get(place.key, "fast"))
                 listing.missed.append(place)
             except EntangledError:

@@ -34,7 +34,7 @@ class Listing:
         self.missed: list[Prefix] = []
 
     def take_next(self) -> Prefix | None:
-        """Return a part to read now, or None if there is none before the next ``add_records``."""
+        """Return a part to read now, or None if no part can be read before the next call of ``add_records``."""
         if not self._unread:
             return None
         if self.reads >= MAX_READS:
@@ -46,7 +46,7 @@ class Listing:
         return self._unread.pop()
 
     def add_records(self, place: Prefix, records: Iterable[Record]) -> None:
-        """Process the ``records`` under the key of ``place``."""
+        """Process the ``records`` under the key of the part ``place``."""
         self._pending_reads -= 1
         below = []
         for device, record in select_listed(place.key, records):
@@ -73,7 +73,7 @@ class Listing:
 
     @property
     def is_complete(self) -> bool:
-        """Whether every part was read, so no device that is listed at the depth of its neighbours is missing."""
+        """Whether every part was read, so that no device listed at the depth of its neighbours is missing."""
         return self.is_over and not self.missed
 
     @property

@@ -27,10 +27,10 @@ MIN_DEVICES_PER_PLACE = 12
 MAX_UNDIVIDED = 64
 """Maximum size of a team whose directory is not split; in larger teams no node knows all others."""
 UNDIVIDED_AGAIN = 48
-"""Maximum size of a team that has shrunk at which its directory is no longer split."""
+"""If a team shrinks to this size or below, its directory is no longer split."""
 ROOT_LISTED_DEPTH = 2
 DEPTH_HYSTERESIS = 0.25
-"""Change of the team's size, in powers of two, by which a limit must be passed before the depth of a device changes."""
+"""The depth of a device changes only if the team's size has passed a limit by this factor (as a power of two)."""
 NEAREST_CONTACTS = 8
 """Number of nearest contacts from which the size of a team is estimated, because a node knows all of these."""
 MAX_LEASE_S = 60.0
@@ -116,8 +116,8 @@ def choose_depth(size: float, depth: int | None = None) -> int:
 def compute_lease(depth: int, lease: float) -> float:
     """Return the seconds for which a device at ``depth`` remains listed after its last renewal.
 
-    ``lease`` is the presence lease of its node.  If there are twice as many devices, each renews half as often, but at
-    least every minute.
+    ``lease`` is the presence lease of the device's node.  If the number of devices doubles, each device renews half as
+    often, but at least every minute.
     """
     return lease if not depth else max(lease, min(MAX_LEASE_S, lease * 2.0**depth))
 

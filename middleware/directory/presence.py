@@ -1,8 +1,8 @@
 """Presence: the record in which each device announces its capabilities and status.
 
 The node renews the lease of the record, so the record disappears when the node does.  When a device joins, it takes a
-number one higher than the highest number that it finds.  The order of these numbers is the order of joining; it needs
-no common clock and is the same at every node.
+number one higher than the highest number that it finds.  These numbers define the order of joining, which is the same
+at every node and needs no common clock.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ READS_PER_S = 16
 ROUND_PAUSE_S = 2.0
 """Minimum seconds between two rounds."""
 DEPTH_MARK = b"\xa5depth"
-"""Byte sequence in the record of each device that is not at depth 0."""
+"""A byte sequence that the record of each device contains, unless the device is at depth 0."""
 
 
 class DeviceSubscription:

@@ -81,7 +81,7 @@ class Background:
 
 
 async def gather_until(enough: Callable[[list[Any]], bool], work: Iterable[Coroutine[Any, Any, Any]]) -> list[Any]:
-    """Return the results of ``work`` when ``enough(results)`` is true, or when all coroutines have ended.
+    """Return the results of the coroutines ``work`` when ``enough(results)`` is true, or when all have ended.
 
     The remaining coroutines continue.  A coroutine that ends with an ``EntangledError`` gives no result.
     """
@@ -129,5 +129,5 @@ async def run_limited(width: int, work: Iterable[Coroutine[Any, Any, Any]]) -> N
 
 
 async def gather_first(needed: int, work: Iterable[Coroutine[Any, Any, Any]]) -> list[Any]:
-    """Return the first ``needed`` results of ``work``, or fewer if all coroutines have ended; the rest continues."""
+    """Return the first ``needed`` results of ``work``, or fewer if all coroutines have ended; others continue."""
     return await gather_until(lambda results: len(results) >= needed, work)

@@ -10,7 +10,7 @@ Value = TypeVar("Value")
 
 
 def put_bounded(table: dict[Key, Value], key: Key, value: Value, most: int) -> None:
-    """Put ``value`` at the end of a table, and delete its first entry if it has more than ``most``."""
+    """Put ``value`` at the end of a table; if the table then has more than ``most`` entries, delete the first."""
     table.pop(key, None)
     table[key] = value
     if len(table) > most:

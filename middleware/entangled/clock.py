@@ -22,7 +22,7 @@ _COMPACT_FROM = 64
 
 
 def find_boot_clock() -> Callable[[], float]:
-    """Return a clock of the seconds since the machine started, including suspension, independent of the wall clock.
+    """Return a clock of the seconds since the machine started, suspensions included; it ignores the wall clock.
 
     On systems without CLOCK_BOOTTIME it is ``time.monotonic``, which may stop during suspension.
     """
@@ -47,7 +47,7 @@ def use_monotonic_time() -> None:
 
 @implementer(IDelayedCall)
 class _HeapCall:
-    """A call of a ``HeapClock``; ``order`` is its position among simultaneous calls, 0 once it is over."""
+    """A call of a ``HeapClock``; ``order`` is its position among simultaneous calls, 0 if it ran or was cancelled."""
 
     __slots__ = ("time", "order", "_clock", "_function", "_arguments", "_keywords", "_is_cancelled")
 

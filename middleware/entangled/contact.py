@@ -37,5 +37,5 @@ def parse_contact(fields: object) -> Contact | None:
     if not (type(port) is int and 0 < port < 65536):
         return None
     contact = Contact(public, Address(host, port))
-    # A virtual address from a peer is meaningless at this node: such a host only means that the contact needs a relay.
+    # A virtual address from a peer is meaningless at this node; it only indicates that the contact needs a relay.
     return Contact(public, relayed_address(contact.node_id)) if host[0] == "~" else contact

@@ -39,7 +39,7 @@ class NoAnswer(TransientError):
 
 
 class NotAcknowledged(NoAnswer):
-    """Fewer replicas stored a write than its consistency level requires; these replicas may still spread the write.
+    """Fewer replicas stored a write than its consistency level requires; they may still send it to other replicas.
 
     ``acknowledged`` replicas confirmed the write, ``needed`` confirmations were required.
     """

@@ -59,11 +59,11 @@ if TYPE_CHECKING:
     from middleware.entangled.space.take_acceptor import TakeAcceptor
 
 NOTE_INTERVAL_S = 30.0
-"""Seconds between two notes of the time and the contacts; a new or lost contact is noted immediately."""
+"""Seconds between two notes in the store of the time and the contacts; a new or lost contact is noted immediately."""
 CONTACTS_NOTE = "contacts"
 LAST_SEEN_NOTE = "last seen"
 INCARNATION_NOTE = "decree/incarnation"
-"""The name of the note that exists if the node was a member of tuple councils in an earlier run."""
+"""The name of a note that exists if the node was a member of councils of tuples before its restart."""
 MAX_NOTED_CONTACTS = 64
 
 Answers = TypeVar("Answers", bound=Callable[..., object])
@@ -72,11 +72,11 @@ Answers = TypeVar("Answers", bound=Callable[..., object])
 class EntangledNode:
     """One node of the network; it runs once, from ``start`` to ``stop``.
 
-    ``lease`` is the time in seconds after which leased records expire when the node is silent.  A higher value causes
-    fewer false failures, a lower value faster detection.  ``rng`` and ``clock`` are the only sources of randomness and
-    time.  ``wall`` returns seconds that continue while the node is off, to measure its absence (None: assume a short
-    absence).  ``admission`` is the admission check.  ``lan`` is the multicast group in which the node finds its team if
-    it has no known nodes.
+    ``lease`` is the time in seconds after which leased records expire when the node is silent.  With a higher value,
+    fewer live nodes are considered failed; with a lower value, failures are detected sooner.  ``rng`` and ``clock`` are
+    the only sources of randomness and time.  ``wall`` returns seconds that continue while the node is off, to measure
+    its absence (None: assume a short absence).  ``admission`` is the admission check.  ``lan`` is the multicast group
+    in which the node finds its team if it has no known nodes.
     """
 
     _log = Logger()
@@ -397,7 +397,7 @@ class EntangledNode:
         self.overlay.mark_rejecting(contact)
 
     def _handle_rejected_peer(self, contact: Contact, code: str) -> None:
-        if code not in (DOUBLED, SUPERSEDED):  # with these codes the other node with that identity stays a member
+        if code not in (DOUBLED, SUPERSEDED):  # with these codes, a second node with this identity stays a member
             self._drop_member(contact.public)
 
     def _drop_member(self, public: bytes) -> None:

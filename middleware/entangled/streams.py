@@ -23,7 +23,8 @@ MAX_VIEWERS = 64
 SUBSCRIPTION_TTL_S = 3.0
 RENEW_INTERVAL_S = 1.0
 RESTART_AFTER_S = 1.0
-"""The seconds without a newer frame after which a lower number is accepted, because the publisher has restarted."""
+"""After this number of seconds without a newer frame, a lower number is accepted, because the publisher has
+restarted."""
 MAX_CHANNEL_CHARS = 32
 
 MAX_AGE_S = 600.0

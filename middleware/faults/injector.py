@@ -32,7 +32,7 @@ MakeTask = Callable[[str, str, float], Task]
 BATTERY_LEVEL = "power.level"
 START_DELAY_S = 0.5
 """Seconds between the reply and the fault, because an isolated or dead node cannot confirm the order.  With packet
-loss, the reply may have to be sent several times in this time."""
+loss, the node may have to send the reply several times before the fault begins."""
 
 
 class State(Enum):
@@ -128,8 +128,8 @@ class FaultInjector:
     """Faults of one node.
 
     The node must use ``wall`` as its wall clock, and open its port through ``open_network``; its agent must use the
-    driver from ``wrap_driver``.  If ``process`` is None, the node cannot be killed or frozen; if no driver is wrapped,
-    its battery cannot read low.
+    driver from ``wrap_driver``.  If ``process`` is None, the node cannot be killed or frozen.  If no driver is wrapped,
+    the fault ``battery`` is not available.
     """
 
     _log = Logger()
@@ -163,7 +163,7 @@ class FaultInjector:
         return self._battery
 
     def expose(self, node: SwarmNode, make_task: MakeTask) -> None:
-        """Let other nodes order and list the faults of ``node``, and publish a predefined task for a scenario.
+        """Let other nodes order and list the faults of ``node``, and let them publish a predefined task for a scenario.
 
         ``make_task`` must raise ``UnknownTask`` for an unknown name.
         """

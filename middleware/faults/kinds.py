@@ -25,8 +25,7 @@ class FaultKind:
     """The properties of one kind of fault.
 
     ``is_lost``: if the device executes a task, another device has to take over.  A kind with a ``unit`` has an amount:
-    ``amount`` is the default, ``least`` and ``most`` are the bounds, and ``means`` is the meaning of the amount in
-    words.
+    ``amount`` is the default value, ``least`` and ``most`` are the bounds, and ``means`` describes the amount in words.
     """
 
     about: str

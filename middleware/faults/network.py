@@ -24,7 +24,7 @@ from middleware.entangled.network.switchboard import PERFECT
 class FaultyNetwork:
     """``network`` with faults.
 
-    ``conditions`` applies to each sent and each received datagram, so it applies twice to a request with its reply.
+    ``conditions`` applies to each sent and each received datagram, so a request and its reply are both affected.
     ``is_receive_blocked``: nothing is received; ``is_send_blocked``: nothing is sent.
     """
 

@@ -1,6 +1,7 @@
 """Run a scenario of faults on a team, and measure the time of each takeover.
 
-The team is a running team (``swarm faults``) or a simulated team in virtual time; the steps are the same for both.
+The team is a running team (``swarm faults``) or a simulated team in virtual time; the steps are the same for both kinds
+of team.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ POLL_INTERVAL_S = 0.05
 DEVICE_TIMEOUT_S = 60.0
 """Seconds to wait for an executing device, or for the device with a given name."""
 SETTLE_S = 6.0
-"""Seconds after a fault for which a takeover is awaited; in this time the remaining devices may also end the task."""
+"""A takeover is awaited for this number of seconds after a fault; meanwhile, the remaining devices may also end the
+task."""
 ROLES_WITHOUT_ROBOT = {"bootstrap", "web"}
 
 

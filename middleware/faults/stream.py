@@ -1,4 +1,4 @@
-"""Faults of a byte stream, for example of the link to an emulated robot; tests or a user set them."""
+"""Faults of a byte stream, for example of the link to an emulated robot; tests or a user set the faults."""
 
 from __future__ import annotations
 

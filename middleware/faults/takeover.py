@@ -10,7 +10,7 @@ from middleware.directory.presence import EXECUTING, Device
 TARGET_S = 2.0
 """Seconds within which another device should take over."""
 OBSERVATION_S = 5.0
-"""Seconds after the end of a fault within which a takeover is still recorded."""
+"""A takeover is still recorded within this number of seconds after the end of a fault."""
 
 
 def find_executing(devices: Iterable[Device]) -> dict[str, str]:

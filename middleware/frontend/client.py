@@ -25,7 +25,7 @@ LOOKUP_S = 1.0
 
 
 class TeamClient:
-    """Watches the team through ``node``, calls devices, and orders tasks.
+    """Watches the team through ``node``, calls devices, and gives orders about tasks.
 
     ``view`` decodes the watched records, ``version`` is the number of their changes, and ``clock`` is the clock of the
     node.

@@ -5,9 +5,10 @@ is in force until it is released, and the team is stopped as long as any stop is
 merged as in a two-phase set: the order and repetition of messages make no difference, and a released stop never comes
 into force again.  Stops are not numbered, so a sender cannot make later stops ineffective with a high number.
 
-Each sender has separate entries, so it cannot displace another sender's stops.  A full table can only make the team
-stop for longer.  If a sender has too many stops, its two oldest are merged into one with a new id, which must be
-released.  If there are too many releases, the oldest is removed, and its stop may have to be released again.
+Each sender has separate entries, so no sender can displace the stops of another sender.  If a table is full, the only
+possible effect is that the team is stopped for longer.  If a sender has too many stops, its two oldest are merged into
+one with a new id, which must be released.  If there are too many releases, the oldest is removed, and its stop may have
+to be released again.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ MAX_RELEASED = 512
 MAX_OPERATOR_CHARACTERS = 64
 """Maximum characters of the operator's name."""
 MAX_OPERATOR_BYTES = 48
-"""Maximum bytes of that name in messages, so that eight stops fit into one record, which every device stores."""
+"""Maximum bytes of an operator's name in messages, so that eight stops fit into one record, which every device
+stores."""
 _SHARED = b""
 """The sender for the stops of senders beyond ``MAX_SENDERS``."""
 

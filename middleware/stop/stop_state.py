@@ -1,4 +1,4 @@
-"""The emergency stops of the whole team that this node knows; its agent obeys them.
+"""The emergency stops of the whole team that this node knows; the agent of this node obeys them.
 
 A stop is sent to every device directly, and is also written as a record for devices that join later or did not receive
 it.  It is in force until a release contains its id (``middleware.stop.stop_set``).  Stops and releases are accepted
@@ -6,8 +6,8 @@ only from members with the permission to give orders.  If the role of a record's
 are accepted, but not its releases.
 
 A node writes a stop to its store before it acknowledges the stop, so a restart does not release it.  If the author of a
-stop has left or was revoked, no record may contain the stop any longer; then a node with the permission to give orders
-adds the stop to its own record.
+stop has left or was revoked, it may happen that no record contains the stop.  Then a node with the permission to give
+orders adds the stop to its own record.
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ class StopState:
         self._entangled.get(STOPS_KEY).addCallbacks(self._on_records, self._ignore_unreachable)
 
     def recheck(self) -> str:
-        """Check again the records whose releases were not accepted, and obey; return the activity as a short text."""
+        """Check again the records whose releases were not accepted; let the agent obey, and return its activity."""
         if self._has_doubtful:
             self._merge_records(self.records)
         return self._notify()
@@ -354,5 +354,5 @@ def collect_stops(records: list[Record]) -> dict[bytes, str]:
 
 
 def _ignore_unwritten(failure: Any) -> None:
-    """Ignore an error for too few reachable replicas: the owner writes the record again when enough are reachable."""
+    """Ignore the error that too few replicas are reachable: the owner writes the record again when enough are."""
     failure.trap(EntangledError)

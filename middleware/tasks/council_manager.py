@@ -97,7 +97,7 @@ class CouncilManager:
     async def find_successors(self, task: Task, proposer: LeaseProposer) -> tuple[Contact, ...] | None:
         """Return the next quorum members of ``task``: the present members that answer, and the closest other nodes.
 
-        None if that would not be an improvement.  Raises ``EntangledError`` if no node answers.
+        Return None if a change would not be an improvement.  Raises ``EntangledError`` if no node answers.
         """
         key, silent = group_key(task.task_id), proposer.find_silent_members(SILENT_S)
         silent_ids = {member.node_id for member in silent}
@@ -119,9 +119,8 @@ def choose_successors(
 ) -> tuple[Contact, ...] | None:
     """Return the quorum members that should replace ``members``, of which some are ``silent``; None for no change.
 
-    Members that answer remain; ``candidates`` are added in order, up to ``size``.  There is a change only if it
-    increases the number of answering members that may be lost: three members instead of two are an improvement, four
-    instead of three are not.
+    Members that answer remain; ``candidates`` are added in order, up to ``size``.  The members change only if more of
+    the answering members may then fail: three members instead of two are an improvement, four instead of three are not.
     """
     silent_ids, member_ids = {member.node_id for member in silent}, {member.node_id for member in members}
     responding = [member for member in members if member.node_id not in silent_ids]
@@ -136,7 +135,7 @@ def choose_successors(
 
 
 def take_odd_number(members: Sequence[Contact]) -> tuple[Contact, ...]:
-    """Return the largest odd number of the first ``members``, because four tolerate no more failures than three."""
+    """Return an odd number of first ``members``: all or all but one, as four tolerate no more failures than three."""
     return tuple(members[: len(members) - 1 + len(members) % 2])
 
 

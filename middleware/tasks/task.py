@@ -1,10 +1,10 @@
 """Tasks, their requirements (Algorithm 4.4), and their records.
 
 A task is a team record under one key, written once by the node that submits it.  Each participant writes its own slot
-under the task's group key, and the outcome is another team record there, so no record is ever changed by two nodes.
-Two kinds of records can be written by nodes that may not order tasks; these contain a proof.  A record of new quorum
-members (``COUNCIL``) contains the signatures of the previous members, and a record of the end of a task (``DONE``) the
-signatures of the members that granted the lease.
+under the task's group key, and the outcome is a further team record under this key, so no record is ever changed by two
+nodes.  Two kinds of records can be written by nodes that may not order tasks; these contain a proof.  A record of new
+quorum members (``COUNCIL``) contains the signatures of the previous members, and a record of the end of a task
+(``DONE``) the signatures of the members that granted the lease.
 """
 
 from __future__ import annotations
@@ -358,7 +358,7 @@ def pack_done(result: Result, proof: bytes) -> bytes:
 
 
 def find_outcome(task: Task, records: Iterable[Record]) -> Result | None:
-    """Return the outcome of ``task``, or None if it has not ended; of several results, that with the highest token.
+    """Return the outcome of ``task``, or None if it has not ended; of several results, the one with the highest token.
 
     A result is valid if it was written by a node that may order tasks (``RESULT``).  A result of an agent (``DONE``) is
     valid if a majority of the quorum members has signed that the task ended under its fencing token.

@@ -24,8 +24,8 @@ LATE_BIDS_S = 0.05
 GATHER_S = 0.1
 """Seconds for which bids are collected before they are sent to other members."""
 INFORMED_MEMBERS = 2
-"""Number of other members that get all bids: the first members that answer, because one of them announces if the first
-member fails."""
+"""Number of quorum members to which this member sends all bids: the first ones that answer.  One of them makes the
+announcement if the first member fails."""
 RETRY_PAUSE_S, MAX_RETRY_PAUSE_S = 1.0, 30.0
 """Seconds after which a silent member is tried again: first and maximum value, doubled each time."""
 MAX_COUNTED_BIDDERS = 4096
@@ -83,7 +83,7 @@ class Announcer:
         self._number = max(self._number, announcement.number)
 
     def make_due_announcement(self, last: Announcement | None, is_strict: bool, now: float) -> Announcement | None:
-        """Return the announcement that is due after ``last``; if ``is_strict``, also when only the standbys changed."""
+        """Return the announcement that is due after ``last``; ``is_strict``: also if only the standbys changed."""
         if now < self._announce_at:
             return None
         self._announce_at = math.inf

@@ -40,7 +40,7 @@ class Bid:
 
     @cached_property
     def rank(self) -> tuple[int, bytes]:
-        """The sort key: of two bids of one agent, even with equal revisions, that with the higher key is valid."""
+        """The sort key: of two bids of one agent, the one with the higher key is valid, even if revisions are equal."""
         content = msgpack.packb(pack_report(self.report))
         return self.revision, hashlib.blake2s(content, digest_size=8).digest()
 

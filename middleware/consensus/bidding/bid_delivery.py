@@ -18,7 +18,8 @@ from middleware.consensus.bidding.outgoing_message import Offer
 from middleware.entangled.contact import Contact
 
 ANNOUNCEMENT_DELAY_S = 0.6
-"""Seconds after the waiting period until an announcement has reached all of 10,000 nodes, even with packet loss."""
+"""Within this number of seconds after the waiting period, an announcement reaches all of 10,000 nodes, even with packet
+loss."""
 REQUEST_SPREAD_SHARE = 0.25
 """Share of the waiting period within which each node sends its request at a random time."""
 MIN_PAUSE_S, MAX_PAUSE_S = 0.5, 10.0
@@ -49,7 +50,7 @@ class BidCheck:
 
     @property
     def is_isolated(self) -> bool:
-        """Whether each quorum member in turn has failed to answer."""
+        """Whether all quorum members have failed to answer, one after another."""
         return self.failures >= len(self._members) > 0
 
     def check_bid(self, bid: Bid, announcement: Announcement | None, is_strict: bool, now: float) -> None:

@@ -1,6 +1,6 @@
 """The group of participants of one task at one participant: publish its report and collect the reports of all.
 
-Thesis, section 4.2.5: agents assigned to the same task write to one part of the DHT and watch it.
+Thesis, section 4.2.5: agents that take part in the same task write under one key of the DHT and watch this key.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class TaskMembers:
     def update_announced(self, reports: Iterable[Report]) -> None:
         """Process an announcement; the reports of members that are not in it remain unchanged.
 
-        The exception are members that were announced earlier, before their records arrived: their records may be newer.
+        There is one exception: for members that were announced before their records arrived, the records may be newer.
         """
         named = {report.agent: report for report in reports if report.agent not in self._left}
         for uuid in self._early - named.keys():
@@ -149,7 +149,7 @@ class Group:
         report = self._view.make_report(member)
         if report is not None:
             self._bidding.report(report)
-        elif self._bidding.has_bid:  # an agent that has not measured yet does not abstain
+        elif self._bidding.has_bid:  # an agent without a measurement may bid later, so this is not an abstention
             self._bidding.withdraw()
 
     def withdraw(self) -> None:

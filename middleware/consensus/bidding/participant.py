@@ -25,7 +25,8 @@ from middleware.consensus.strategy import Report
 from middleware.entangled.contact import Contact
 
 RELAY_DELAY_S = 0.4
-"""Seconds of silence after which a forwarding node requests the announcement, before the nodes of its subtree do."""
+"""A forwarding node requests the announcement after this number of seconds of silence, earlier than the nodes of its
+subtree."""
 
 MAX_REVISION = 2**32
 """Upper bound of valid revisions; a node ignores a higher announced revision, because it must be forged."""

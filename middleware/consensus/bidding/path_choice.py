@@ -12,7 +12,7 @@ DIRECT, TREE = "direct", "tree"
 MAX_DIRECT_BIDDERS = 30
 """Maximum number of bidders with the direct path; 3 quorum members then receive 90 bids in total."""
 MIN_TREE_BIDDERS = 24
-"""Minimum number of bidders with which a team that has shrunk still uses the tree."""
+"""A team that has shrunk still uses the tree if it has at least this number of bidders."""
 
 
 class PathChoice:

@@ -12,7 +12,7 @@ from middleware.entangled.contact import Contact
 MAX_RECIPIENTS = 1024
 """Maximum number of listeners; the oldest is removed, and then has to request the announcement."""
 RETRY_PAUSES_S = (0.0, 1.0, 2.0, 4.0)
-"""Seconds after each failed message until the next; after the last failure, the listener has to request the
+"""Seconds between each failed message and the next message; after the last failure, the listener has to request the
 announcement."""
 NO_PRECEDENCE = (0, 0)
 

@@ -19,7 +19,8 @@ from middleware.tasks.task import Member
 MAX_SMALL_TEAM = 12
 """Maximum number of devices of a team in which every participant writes."""
 ENOUGH_RECORDS = 8
-"""Number of other records that are sufficient.  Announced agents write records in any case.
+"""If there are this number of records of other participants, a participant need not write its own.  Announced agents
+write records in any case.
 
 In groups of up to this size all participants write records, whatever the size of the team.
 """
@@ -28,7 +29,7 @@ LISTENING_S = 0.3
 TURN_SPACING_S = 0.02
 """Average seconds between two turns; about five participants write records before the first record arrives."""
 SETTLING_S = 1.0
-"""Seconds after the last turn until its record has reached all participants."""
+"""Seconds after a turn until the record written in it has reached all participants."""
 RECORD_PAUSE_S = 1.0
 """Minimum seconds between two records of one reporter without urgent changes."""
 ASSUMED_PRESENT_S = 1.0
@@ -64,7 +65,7 @@ class Reporters:
 
     @property
     def is_written(self) -> bool:
-        """Whether there is a record of this participant, possibly from an earlier run."""
+        """Whether there is a record of this participant, possibly from before its restart."""
         return self._written is not None or self._is_recorded
 
     @property

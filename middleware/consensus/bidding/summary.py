@@ -60,7 +60,7 @@ class Summary:
         return self._bids != before
 
     def _remove_unneeded(self) -> None:
-        """Remove bids that neither are standing nor replaced a bid; limit the number of the latter."""
+        """Remove bids that are not standing and replaced no bid; limit the number of bids that replaced one."""
         standing = {report.agent for report in self._standing}
         needed = {agent: bid for agent, bid in self._bids.items() if agent in standing or bid.revision}
         not_standing = [agent for agent in needed if agent not in standing]

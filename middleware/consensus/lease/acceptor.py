@@ -11,7 +11,8 @@ from middleware.entangled.quorum.register import Register, Reply, ReplyKind
 
 MAX_LISTENERS = 16
 ENDED_AGE_S, IDLE_AGE_S = 600.0, 86_400.0
-"""Seconds after the last change until a register may be evicted, for an ended task and for any other task."""
+"""Seconds after its last change from which a register may be evicted: for an ended task, and for a task that has not
+ended."""
 
 
 class LeaseAcceptor(Acceptor[str]):

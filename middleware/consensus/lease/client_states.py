@@ -188,7 +188,7 @@ TABLE: Mapping[State, Mapping[Event, Step]] = {
 """The transitions.  A pair of state and event that is neither here nor in ``IMPOSSIBLE`` has no effect."""
 
 TIMED = (S.WATCHING, S.WAITING, S.PROMISED, S.HOLDING, S.OUTBID)
-"""States in which a timer runs, except between MOVE and MOVED."""
+"""States in which a timer runs, except while the council changes (between the events MOVE and MOVED)."""
 ASKING = (S.LOOKING, S.PREPARING, S.PROPOSING)
 """States in which a round is running."""
 ACTIVE = tuple(state for state in State if state not in (S.IDLE, S.OVER))

@@ -32,13 +32,13 @@ from middleware.entangled.quorum.round import RETRY_INTERVAL_S, Round
 CLOCK_MARGIN = 0.02
 """Maximum relative drift between the clocks of two correct nodes, each of which drifts by at most 1 %."""
 RENEWALS_PER_TTL = 3
-"""Number of renewals of a holder, or requests of a standby, per ttl."""
+"""Number of renewals by a holder per ttl, and number of requests by a standby per ttl."""
 RETRY_S = 0.1
 JITTER_S = (0.0, 0.02)
 BACK_OFF_S = (0.02, 0.08)
 """Minimum and maximum seconds before the next attempt after the claim of another agent was faster."""
 SOON_PERIODS = 1.5
-"""Number of poll periods; a lease that ends within them is claimed at its end without another poll."""
+"""A lease that ends within this number of poll periods is claimed at its end without another poll."""
 RELEASE_SPREAD_S = 0.3
 """Seconds after a notification of a release for which some members may not know of the release yet."""
 FIRST_STANDBY_SHARE = 0.8
@@ -50,7 +50,7 @@ delay their reply to an early request."""
 STAGGER_S = 0.2
 """Additional seconds that each standby waits, compared with the standby of the next lower rank."""
 LATE_TIMER_S = 0.05
-"""Minimum seconds by which a timer is late if the process may have been suspended."""
+"""If a timer is late by at least this number of seconds, the process may have been suspended."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,8 @@ class _Standby:
     """The client's ``rank`` among the standbys, and its estimates about the lease of another agent.
 
     If an agent released the lease, ``freed_at`` is the time from which its robot is at rest.  ``ends_at`` is the
-    estimated end of the lease, and ``is_outbid`` is true if a member had promised a higher ballot in the last round.
+    estimated end of the lease.  ``is_outbid`` is true if, in the last round, a member replied that it had promised a
+    higher ballot.
     """
 
     rank: int = 0
@@ -181,13 +182,14 @@ class LeaseClient:
     def release(self, heirs: Sequence[Contact] = (), rest: float = 0.0) -> Deferred[object]:
         """Release the lease, or stop claiming it; fire when the council has been notified.
 
-        Stop the device first.  The council grants no lease before the robot is at rest: after the robot's stop time,
-        and after ``rest`` more seconds if the robot cannot be stopped now.  The members notify the standbys; this
-        client also notifies ``heirs`` directly, half a round trip earlier.
+        Stop the device first.  The council grants the next lease only when the robot is at rest: it waits for the
+        robot's stop time, plus ``rest`` seconds if the robot cannot be stopped now.  The members notify the standbys;
+        this client also notifies the standbys ``heirs`` directly, which is half a round trip faster.
         """
         done: Deferred[object] = succeed(None)
         if self.lease is not None:
-            # With the margin for clock drift, because a later release of another claim repeats the remaining time.
+            # The margin for clock drift is included, because a later release of another claim sends the remaining time
+            # again.
             moving_s = (rest + self._stop_time) * (1.0 + CLOCK_MARGIN)
             self._at_rest_at = min(self._at_rest_at, self._clock.seconds() + moving_s)
         self._handle(Event.RELEASE)
@@ -412,8 +414,8 @@ class LeaseClient:
         If the time of the claim is far off or unknown, the client polls first, because a notification may be lost.
         """
         wait = self._compute_turn_delay() if self._is_recently_released else self._compute_claim_delay()
-        # A holder without faults renews its lease well before the end, so a lease that ends soon is claimed without a
-        # poll.
+        # A holder without faults renews its lease well before the end. So if a lease is about to end, its holder has
+        # probably failed, and the lease is claimed without a poll.
         is_far = wait > SOON_PERIODS * self._poll_period
         self._handle(Event.FAR if is_far else Event.NEAR, delay=(self._poll_period if is_far else wait) + pause)
 
@@ -442,7 +444,7 @@ class LeaseClient:
 
     @property
     def _max_wait_s(self) -> float:
-        """Maximum remaining seconds of a lease for whose end a round waits; unlimited after a release."""
+        """Maximum remaining seconds of a lease whose end a round waits for; unlimited after a release."""
         return math.inf if self._is_recently_released else RETRY_INTERVAL_S
 
     def _handle_timer(self) -> None:

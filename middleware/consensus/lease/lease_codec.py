@@ -18,7 +18,7 @@ MAX_COUNCIL = 7
 MAX_PROOF_BYTES = 2**16
 _BUCKETS = 64
 BALLOT_MODULUS = 2**20
-"""Modulus of ballot counters; each run of an agent uses a random remainder."""
+"""All ballot counters of an agent have the same random remainder modulo this number until the agent restarts."""
 EARLY_PROMISE_SHARE = 0.2
 """The next lease may be promised at most this share of the ttl before the end of the current one."""
 
@@ -91,7 +91,7 @@ def _pack_floor(floor: Floor) -> bytes:
 def _unpack_floor(noted: bytes | None) -> Floor | None:
     state = unpack_note(noted or b"")
     if isinstance(state, list) and len(state) == 2:
-        state = [*state, state[0]]  # written by an older version, with one floor for counter and token
+        state = [*state, state[0]]  # an older version wrote this note, with one floor for counter and token
     if not isinstance(state, list) or len(state) != 3:
         return None
     counter, longest, token = state
@@ -100,7 +100,7 @@ def _unpack_floor(noted: bytes | None) -> Floor | None:
 
 
 def parse_row(row: object) -> Register | None:
-    """Decode the register of one task from a note; None if it is invalid; never raises."""
+    """Decode the register of one task from a note, or return None if the note is invalid; never raises."""
     if not isinstance(row, list) or not 6 <= len(row) <= 8:
         return None
     configuration, ballots, token, ttl, packed, is_over = row[:6]

@@ -29,7 +29,7 @@ IsGenuine = Callable[[int, Reply], bool]
 ParseCharter = Callable[[str, object], Charter | None]
 """Decodes and checks a charter: (task id, packed)."""
 SKIPPED_COUNTERS = 16
-"""Number of ballot counters to skip, more than a holder uses before a standby polls again."""
+"""Number of ballot counters to skip: more than a holder uses between two polls of a standby."""
 
 
 class LeaseHeld(Refused):
@@ -146,7 +146,7 @@ class LeaseProposer:
         self.token = max(self.token, highest_credible([token], len(self.members)))
 
     def learn_from(self, round_: Round) -> None:
-        """Learn the used counters and tokens, and changes of the council, from the replies of a round."""
+        """Learn from the replies of a round which counters and tokens were used, and how the council changed."""
         replies, size = round_.tally.replies.values(), len(self.members)
         self._ballot_quotient = max(
             self._ballot_quotient,
@@ -179,8 +179,9 @@ class LeaseProposer:
     def close(self, token: int = 0) -> Deferred[None]:
         """Close the task at its council, so that no more leases are granted; fire when no agent can act on the task.
 
-        ``token`` is the token of the agent that finished the task, whose device must be at rest.  It is 0 for a node
-        whose role allows orders.  Fails with ``NoMajority``, or with ``Superseded`` if a higher token was granted.
+        ``token`` is the token of the agent that finished the task, whose device must be at rest.  It is 0 if the caller
+        is a node whose role allows it to give orders.  Fails with ``NoMajority``, or with ``Superseded`` if a higher
+        token was granted.
         """
         return Deferred.fromCoroutine(self._close(token))
 

@@ -38,9 +38,9 @@ Answer = list[object] | Deferred[list[object]]
 class LeaseService:
     """The lease service of one node: its acceptor, and the lease clients that are notified of releases.
 
-    The service may be created at the first request.  ``born_at`` is the time at which the node started, from which the
-    acceptor computes the time for which it has to be silent.  ``charter_verifier`` checks charters; ``may_be_member``
-    returns whether the owner of a key may be a council member.
+    The service may be created at the first request.  ``born_at`` is the time at which the node started; from this, the
+    acceptor computes how long it has to be silent.  ``charter_verifier`` checks charters; ``may_be_member`` returns
+    whether the owner of a key may be a council member.
     """
 
     def __init__(

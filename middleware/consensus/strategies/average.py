@@ -14,7 +14,7 @@ Point = tuple[float, ...]
 class Average(Nearest):
     """The weighted mean of all reported values.
 
-    The agent with the lowest cost acts. Its task is to publish the value, which is identical at all nodes.
+    The agent with the lowest cost acts. The only action is to publish the value, which is identical at all nodes.
     """
 
     name = "average"
@@ -46,10 +46,7 @@ class Average(Nearest):
 
 
 def mean(points: Sequence[Point], weights: Sequence[float]) -> Point:
-    """Return the weighted mean.
-
-    It does not depend on the order of the points, and is clamped to their bounding box.
-    """
+    """Return the weighted mean, clamped to the bounding box of the points; their order makes no difference."""
     total = math.fsum(weights)
     found = []
     for numbers in zip(*points, strict=True):

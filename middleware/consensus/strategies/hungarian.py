@@ -33,7 +33,7 @@ def find_optimum(costs: Costs) -> tuple[list[int], list[float]]:
     minus price in that row, which proves that the assignment is optimal.
     """
     wide = len(costs[0])
-    prices: list[float] = [0 * costs[0][0]] * wide  # of the costs' type, so that integer sums stay exact
+    prices: list[float] = [0 * costs[0][0]] * wide  # same type as the costs, so that integer sums stay exact
     owner = [-1] * wide
     free = list(range(len(costs)))
     for _ in range(2):

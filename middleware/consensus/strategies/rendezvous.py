@@ -117,6 +117,6 @@ def _circumscribe(*places: Point) -> tuple[Point, float]:
 
 
 def _clamp(place: Point, places: Sequence[Point]) -> Point:
-    """Clamp ``place`` to the bounding box of the points, against rounding errors."""
+    """Clamp ``place`` to the bounding box of the points, because rounding errors may move it outside."""
     sides = zip(place, zip(*places, strict=True), strict=True)
     return tuple(min(max(x, min(numbers)), max(numbers)) for x, numbers in sides)

@@ -14,9 +14,10 @@ class WeightedVote(Nearest):
     """A vote in which the newest vote of each agent has the agent's weight.
 
     An agent with a report without a choice has not voted yet. An option with more than half of the weight of all agents
-    that may vote wins immediately. No node can find a different majority, whatever subset of the reports it has, if all
-    reports contain the same ``electorate``. If all agents have voted without such a majority, the heaviest option wins;
-    ties are broken by the lowest hash. The agent with the lowest cost among the voters of the winning option acts.
+    that may vote wins immediately. If all reports contain the same ``electorate``, no node can find a different
+    majority, whatever subset of the reports it has. If all agents have voted without such a majority, the heaviest
+    option wins; ties are broken by the lowest hash. The agent with the lowest cost among the voters of the winning
+    option acts.
     """
 
     name = "weighted_vote"

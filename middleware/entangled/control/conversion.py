@@ -71,7 +71,7 @@ def parse_field(word: str) -> Any:
 
 
 def parse_template_field(word: str) -> Any:
-    """Parse a template field: ``_`` any, ``?int`` a type, ``>5`` ``!=red`` a predicate, otherwise a value."""
+    """Parse a template field: ``_`` (any value), ``?int`` (a type), ``>5`` or ``!=red`` (a predicate), or a value."""
     if word == ANY_WORD:
         return {"any": True}
     if word.startswith("?"):

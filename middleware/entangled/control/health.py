@@ -51,7 +51,8 @@ def read_health(node: EntangledNode) -> Mapping[str, Any]:
 async def measure_links(node: EntangledNode, clock: IReactorTime) -> list[Mapping[str, Any]]:
     """Return the path to each peer with the durations of ``PINGS`` pings, None for a lost ping.
 
-    All times are seconds; ``for`` is the time for which the path has been in use, None if the peer is unreachable.
+    All times are seconds; The field ``for`` is the time for which the path has been in use (None: the peer is
+    unreachable).
     """
     contacts = sorted(node.overlay.contacts(), key=lambda contact: contact.node_id)[:MAX_LINKS]
     pings = [Deferred.fromCoroutine(_ping_repeatedly(node, clock, contact)) for contact in contacts]

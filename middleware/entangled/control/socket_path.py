@@ -1,6 +1,6 @@
 """Location of the control sockets of this machine's nodes: one file per node, accessible only to its user.
 
-Any user may create a folder, a link or a socket in ``/tmp``, so node and client check who owns each of these.
+Any user may create a folder, a link or a socket in ``/tmp``, so node and client check the owner of each.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def list_files(ending: str) -> list[Path]:
 
 
 def find_socket(name: str | None) -> Path:
-    """Return the socket of node ``name`` (None: the only node); raise ``NoControl`` with the existing names."""
+    """Return the socket of node ``name`` (None: the only node); ``NoControl`` contains the existing names."""
     names = [path.name.removesuffix(SUFFIX) for path in list_files(SUFFIX)]
     if name is None and len(names) == 1:
         name = names[0]

@@ -37,7 +37,7 @@ CREATE_ROTTEN = (
     " ttl REAL, signature BLOB, crc INTEGER, value BLOB)"
 )
 MAX_CORRUPT_ROWS = 16
-"""The number of corrupt rows that are kept for diagnosis; it limits the space that they use on the SD card."""
+"""The maximum number of corrupt rows that are kept for diagnosis; it limits their space on the SD card."""
 
 FIELDS = "key, owner, name, sequence, lifetime, ttl, signature, crc, value"
 SELECT_RECORDS = f"SELECT {FIELDS} FROM records"
@@ -137,7 +137,7 @@ def create_tables(connection: sqlite3.Connection, version: int) -> None:
 def read_contents(connection: sqlite3.Connection) -> Contents:
     """Read the whole file, records in order of insertion."""
     found = Contents()
-    # Many rows have the same owner or key; let them share one bytes object to save memory.
+    # Many rows have the same owner or key; such rows share one bytes object to save memory.
     known: dict[bytes, bytes] = {}
     for row_id, key, owner, *rest in connection.execute(f"SELECT id, {FIELDS} FROM records ORDER BY id"):
         record = parse_row([known.setdefault(key, key), known.setdefault(owner, owner), *rest])

@@ -84,8 +84,8 @@ class SqliteStore(Store):
         records are removed.  A corrupt file is renamed, and the store starts empty except for the notes that could be
         read.  ``deliver`` is ``reactor.callFromThread``, or None if the caller never waits for ``wait_for_write``.
         ``fresh_epoch`` is the epoch of a new store, random if None.  With ``durable`` set to ``power``, written data
-        survives a power failure.  With ``crash``, written data survives only a crash of the process: commits do not
-        wait for the disk, and a power failure may lose the last commits, without further damage.
+        survives a power failure.  With ``crash``, written data survives only a crash of the process.  Commits then do
+        not wait for the disk, so a power failure may lose the last commits, but causes no further damage.
         """
         path = os.fspath(path)
         fresh_epoch = os.urandom(8) if fresh_epoch is None else fresh_epoch
@@ -154,7 +154,7 @@ class SqliteStore(Store):
         """
         if self._writer.close():
             self._connection.close()
-            # Closed last, because closing any descriptor of the file releases SQLite's locks on it.
+            # The lock is closed last, because closing any descriptor of the file releases SQLite's locks on the file.
             os.close(self._lock)
 
     # -- inside ------------------------------------------------------------------------------------------------------
@@ -213,7 +213,7 @@ def _open_file(path: str, durable: Durability) -> tuple[sqlite3.Connection, int,
         connection = sqlite3.connect(path, isolation_level=None, check_same_thread=False, timeout=5.0)
         use_bytes(connection)
         version = check_version(path, connection)
-        # Done only after the check, to leave another program's file unchanged.
+        # This is done only after the check, so that a file of a different program stays unchanged.
         os.fchmod(lock, 0o600)
         connection.execute("PRAGMA journal_mode = WAL")
         # Robots lose power at any time; levels below FULL lose the last commits, levels below NORMAL may damage the

@@ -4,12 +4,13 @@
 seconds of the caller's clock; the caller passes expiry times and the current time.
 
 If there is not enough space for a record, the store removes tombstones older than ``hold``, the oldest first, and no
-more than needed.  This is safe because a node with a longer absence joins with an empty store.  The store evicts
-nothing else: if the space is still not enough, ``put`` raises ``Full`` and changes nothing.
+more than needed.  This is safe, because a node that was absent for longer than ``hold`` joins with an empty store.  The
+store evicts only tombstones: if the space is still not enough, ``put`` raises ``Full`` and changes nothing.
 
-Each owner may use as much space as is left free: a dynamic threshold, as in switches with a shared buffer (Choudhury
-and Hahne, 1998).  A single owner gets up to half of the rows and bytes; k owners that write without end leave 1 in 2**k
-free.  A record of an owner above its share is rejected unless removing tombstones of the same owner frees enough space.
+The share of each owner is as large as the space that is still free: a dynamic threshold, as in switches with a shared
+buffer (Choudhury and Hahne, 1998).  A single owner gets up to half of the rows and bytes; k owners that write without
+end leave 1 in 2**k free.  A record of an owner above its share is rejected unless removing tombstones of the same owner
+frees enough space.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ from middleware.entangled.record import Record, Slot
 
 MAX_ROWS = 12_000
 """The maximum number of slots of a store.  A larger network needs more slots; each slot takes 1.2 KiB of memory in
-addition to the ``count_bytes`` of its record.  With this value and ``MAX_BYTES``, a full store adds 22 MiB to a node of
-40 MiB, which is the limit for a device with 64 MB."""
+addition to the ``count_bytes`` of its record.  With this value and ``MAX_BYTES``, a full store adds 22 MiB to the 40
+MiB of a node; together this is the limit for a device with 64 MB."""
 MAX_BYTES = 8 * 2**20
 """The maximum bytes of a store, counted by ``count_bytes``.  A higher value allows more large values, but uses more
 memory and flash."""
@@ -37,7 +38,7 @@ TOMBSTONE_HOLD_S = 86_400.0
 restore a deleted record.  A higher value is safer; a lower value frees space earlier."""
 MIN_OWNER_ROWS = 250
 MIN_OWNER_BYTES = 65_536
-"""The minimum share of each owner in bytes, independent of other owners, as long as the store has space."""
+"""The share of each owner has at least this number of bytes, as long as the store has space."""
 FIXED_BYTES = 17
 """The bytes of a record's sequence number (8), ttl (8) and lifetime (1)."""
 
@@ -184,7 +185,8 @@ class Store:
         leased = 0
         for held in self._by_owner.get(owner, {}).values():
             if held.record.lifetime == "leased":
-                # The heap still contains the old time; at that time ``expire`` queues the record again.
+                # The heap still contains the old expiry time; when that time is reached, ``expire`` queues the record
+                # again.
                 held.expires_at = max(held.expires_at, expires_at)
                 leased += 1
         return leased
@@ -206,7 +208,7 @@ class Store:
                 self._queue(held)
             else:
                 expired.append((held.expires_at, slot, self._remove(slot)))
-        # The heap returns a record with an extended lease at its old time.
+        # The heap returns a record with an extended lease at the expiry time before the extension.
         expired.sort(key=lambda ended: ended[:2])
         return removed + [record for _, _, record in expired]
 

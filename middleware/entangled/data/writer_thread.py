@@ -24,7 +24,7 @@ COMMIT_AFTER_S = 0.02
 """Seconds for which a change may wait for further changes if no caller waits for it.  A higher value causes fewer
 writes to the flash card; with a lower value fewer changes are lost in a power failure."""
 MAX_BATCH = 200
-"""The number of pending changes from which they are committed without waiting."""
+"""If at least this number of changes is pending, they are committed without waiting."""
 RETRY_INTERVAL_S = 0.5
 """Seconds between two attempts after a failed commit, as on a full disk."""
 
@@ -163,7 +163,7 @@ class Writer:
     # -- the writer's thread -------------------------------------------------------------------------------------------
 
     def _run(self) -> None:
-        """Write until the store is closed, and then until no changes are left or a commit fails."""
+        """Write until the store is closed; then write the remaining changes, or stop at a failed commit."""
         ended = False
         while not ended:
             batch, waiting = self._take_batch()

@@ -29,7 +29,7 @@ BACKOFF_S = (0.2, 0.8)
 """The shortest and longest pause in seconds between two tries; the tunnel network itself limits the rate of
 dialling."""
 DIRECT_RETRY_INTERVALS_S = (5.0, 15.0, 60.0)
-"""The seconds between the attempts to return to UDP; the last one repeats."""
+"""The seconds between the attempts to return to UDP; the last interval repeats."""
 CHECK_INTERVAL_S = 1.0
 DIRECT_TIMEOUT_S = 0.5
 """The timeout of a discovery request over UDP in seconds; a reachable node answers in one round trip."""

@@ -32,7 +32,7 @@ TARGET_REPLIES = 4
 MAX_REPLY_DELAY_S = 0.1
 """The maximum delay of a reply in seconds; the first DISCOVERY of a node is delayed by up to a fifth of it."""
 ALONE_INTERVALS_S = (0.2, 0.3, 0.5, 1.0, 2.0, 5.0)
-"""The seconds between the multicasts of a node without contacts; the last one repeats."""
+"""The seconds between the multicasts of a node without contacts; the last interval repeats."""
 SHARED_INTERVAL_S = 30.0
 """The mean seconds between two multicasts of the whole team: each node waits this time multiplied by the number of
 members."""
@@ -43,8 +43,8 @@ RECENT_S = 2.0
 RETRY_INTERVAL_S = 4.0
 """The seconds before a discovery request to the same address is repeated."""
 MAX_PARALLEL = 3
-"""The number of simultaneous discovery requests; the first node that answers also sends the other contacts of its
-network."""
+"""The maximum number of simultaneous discovery requests.  A few are enough, because the first node that answers also
+sends the contacts of its network."""
 MAX_PENDING = 64
 """The maximum number of delayed replies, and therefore of replies within ``MAX_REPLY_DELAY_S``."""
 MAX_RECORDED = 256
@@ -142,7 +142,7 @@ class LanDiscovery:
     def _on_reply(self, source: Address) -> None:
         """Send a discovery request to the source of a reply, unless it is a known contact."""
         now, overlay = self._clock.seconds(), self._overlay
-        # The first contact may not have sent the other members yet.
+        # Possibly the first contact has not told this node about the other members yet.
         if (overlay.has_all_members or overlay.is_large) and any(
             known.address == source for known in overlay.contacts()
         ):

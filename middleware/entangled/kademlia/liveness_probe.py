@@ -18,8 +18,8 @@ from middleware.entangled.wire.endpoint import Endpoint
 STEP_S = 1.0
 """The seconds between two steps."""
 DISCONNECTED_S = 3.0
-"""The silence of all nodes in seconds after which distant contacts are not probed, because this node itself is probably
-disconnected."""
+"""If all nodes were silent for this number of seconds, distant contacts are not probed, because this node itself is
+probably disconnected."""
 LOOKUP_INTERVALS_S = (3.0, 60.0)
 """The first and the longest interval in seconds between a newcomer's lookups of its neighbours; the interval doubles
 each time."""
@@ -35,19 +35,19 @@ SESSION_S = 120.0
 permanent sessions."""
 
 MIN_SILENCE_S, INITIAL_SILENCE_S, MAX_SILENCE_S = 15.0, 60.0, 300.0
-"""The silence in seconds after which a distant contact is probed: minimum, initial and maximum."""
+"""A distant contact is probed after this number of seconds of silence: the minimum, initial and maximum value."""
 TARGET_FAILURES = 0.05
 GROWTH_FACTOR = 2.0 ** (TARGET_FAILURES / (1 - TARGET_FAILURES))
-"""The factor by which the silence grows with each answer."""
+"""The factor by which the silence before a probe grows with each answer."""
 
 
 class ProbeInterval:
     """The adaptive interval between probes of distant contacts; ``wait`` is their silence in seconds before a probe.
 
     In a stable network nearly every probe is unnecessary; in a network with high churn most contacts fail within a
-    minute.  Therefore the interval is halved for each lost contact and grows slightly with each answer.  In equilibrium
-    the fraction ``TARGET_FAILURES`` of the probed contacts has failed.  According to the measurements of Kademlia and
-    Bamboo this fraction does not slow lookups.
+    minute.  Therefore the interval is halved for each lost contact and grows slightly with each answer.  In
+    equilibrium, a share ``TARGET_FAILURES`` of the probed contacts has failed; measurements of Kademlia and Bamboo show
+    that this share does not slow down lookups.
     """
 
     __slots__ = ("silence_s",)

@@ -49,7 +49,7 @@ class Lookup:
 
     @property
     def is_finished(self) -> bool:
-        """Whether the k closest candidates, except failed ones, have answered; True if there are no candidates."""
+        """Whether the k closest candidates that have not failed have answered; True if there are no candidates."""
         return all(self._states[node_id] is _State.ANSWERED for node_id in self._nearest(_State.FAILED))
 
     def take_next(self) -> list[Contact]:
@@ -77,7 +77,7 @@ class Lookup:
             self._set_state(contact.node_id, _State.FAILED)
 
     def mark_slow(self, contact: Contact) -> None:
-        """Exclude ``contact`` from the parallel requests without giving up on it (a hedge)."""
+        """No longer count ``contact`` among the parallel requests; its answer is still accepted (a hedge)."""
         if self._states.get(contact.node_id) is _State.ASKED:
             self._set_state(contact.node_id, _State.SLOW)
 
@@ -100,7 +100,7 @@ class Lookup:
         self._states[node_id] = state
 
     def _nearest(self, *without: _State) -> list[bytes]:
-        """Return the k closest candidates in none of these states."""
+        """Return the k closest candidates that are in none of the given states."""
         nearest: list[bytes] = []
         for _, node_id in self._order:
             if self._states[node_id] not in without:

@@ -10,7 +10,7 @@ leave one after the other.  In any case it is removed after ``MAX_ABSENT_S``, wh
 partition.
 
 A newcomer is *settled* when it has synchronised with a majority of the earlier members.  Until then it is not counted
-in majorities; otherwise a minority behind a partition could become a majority with the help of newcomers.
+in majorities; otherwise newcomers could turn the smaller side of a partition into a majority.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ MAX_MEMBERS = 64
 complete knowledge.
 """
 ABSENT_WITH_MAJORITY_S = 30.0
-"""The duration of three rounds of repair, after which other replicas store the records of the absent member."""
+"""The seconds of three rounds of repair; after them, other replicas store the records of the absent member."""
 MAX_ABSENT_S = 120.0
 """The longest partition in seconds in which majorities remain valid.  A higher value is safer; a lower value allows
 writes earlier."""
@@ -147,7 +147,7 @@ class MemberTable:
         return self._digest
 
     def is_majority_alive(self, now: float, within: float) -> bool:
-        """Return whether this node and members heard in the last ``within`` seconds are a majority of the settled."""
+        """Return whether this node and the members heard within ``within`` seconds are a majority of the settled."""
         return self._is_majority([member for member in self._live if now - member.last_received_at <= within])
 
     def remove_expired(self, now: float) -> list[Contact]:

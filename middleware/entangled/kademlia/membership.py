@@ -37,14 +37,15 @@ REFRESH_INTERVAL_S = 3600.0
 """The seconds after which a bucket without a lookup is refreshed (Kademlia, section 2.3)."""
 BACKOFF_S = (0.2, 5.0)
 HINT_AFTER = 4
-"""The number of failed tries after which the log suggests a diagnosis, once; a node of another team gets no answer."""
+"""After this number of failed tries, the log suggests a diagnosis, once: a node gets no answer if it belongs to another
+team."""
 MAX_FORMER_ADDRESSES = 32
 """The number of remembered addresses of known nodes and lost contacts, which are tried when no contact is left."""
 RETRY_INTERVAL_S = 4.0
 """The seconds before an absent member, or a member that is only known from other nodes, is tried again."""
 LARGE_REPORT_S = 60.0
-"""The seconds for which a notification that the network is large is valid.  A node without a further notification for
-this time starts to learn all members again."""
+"""The seconds for which a notification that the network is large is valid.  A node that gets no further notification
+during this time starts to learn all members again."""
 NEWCOMER_DELAY_S = 0.02
 """The seconds that a newcomer waits before it contacts the next few unknown members, so as not to delay the first
 reads.  A random delay of up to the same length is added."""
@@ -157,7 +158,7 @@ class Membership:
     # -- private ----------------------------------------------------------------------------------------------------
 
     async def _contact_any(self, known: list[Address], remembered: Sequence[Address]) -> bool:
-        """Return whether any of the addresses answers; delete from ``known`` the addresses of this node itself."""
+        """Return whether any of the addresses answers; delete this node's own addresses from ``known``."""
         addresses = list(dict.fromkeys([*known, *remembered]))
         greetings = await DeferredList([self._endpoint.discover(address) for address in addresses], consumeErrors=True)
         found = []
@@ -179,7 +180,7 @@ class Membership:
         digest = self._overlay.members.digest() if self._overlay.has_all_members else b""
         answer = await self._overlay.ask(contact, "ping", digest, changes=True)
         if answer == b"" and not self._overlay.has_found_neighbours and not self._overlay.has_all_members:
-            # the network is large; the remaining duration is requested after this node has found its neighbours
+            # the network is large; how long this is valid is requested after this node has found its neighbours
             self._set_large(0.0)
         self._compare(contact, _LARGE_DIGEST if answer == b"" else answer)
 
@@ -229,7 +230,7 @@ class Membership:
             if answer is None or (type(answer) is int and answer > 0):
                 return self._set_large(LARGE_REPORT_S if answer is None else min(float(answer), LARGE_REPORT_S))
             if self._overlay.is_large or type(answer) is int:
-                return None  # ``contact`` has no valid notification that the network is large
+                return None  # ``contact`` does not know for how long the network is considered large
             found = parse_contacts(answer)
             for named in found:
                 self._overlay.on_named(named, contact)
@@ -367,7 +368,7 @@ class Membership:
     def _answer_members(self, peer: Contact, after: bytes) -> list[object] | int | None:
         """Answer MEMBERS: return the page of members after the id ``after``.
 
-        In a large network return None, or the seconds for which this node's notification of that is still valid.
+        In a large network, return None, or the seconds for which this node still considers the network large.
         """
         if len(after) not in (0, len(peer.node_id)):
             raise Refused("members: the argument must be empty or a node id of 20 bytes")

@@ -42,8 +42,9 @@ INITIAL_HEDGE_S, MAX_HEDGE_S = 0.01, 0.15
 """The delay of a hedged request in seconds before the first measurement, and the maximum delay.  After measurements the
 delay is the time within which nearly all answers arrive."""
 MIN_LOOKUP_TIMEOUT_S, MAX_LOOKUP_TIMEOUT_S, TIMEOUTS_PER_REQUEST = 0.4, 2.5, 2.6
-"""The minimum and maximum timeout in seconds of a request of a lookup in a large network, and the factor by which it
-exceeds the initial timeout.  This factor is enough for two tries; at a high loss rate the timeout is longer."""
+"""The minimum and maximum timeout in seconds of a request of a lookup in a large network, and the factor by which the
+timeout exceeds the initial timeout of a request.  This factor is enough for two tries; at a high loss rate the timeout
+is longer."""
 MAX_FOUND = 512
 """The number of keys for which the result of the last lookup is cached."""
 MAX_RECORDED = 4096
@@ -57,7 +58,7 @@ MAX_LOOKUP_STATS = 16
 
 
 class Voters(NamedTuple):
-    """The nodes among which a majority is counted: the known ``ids``, and the number of all voters (``size``)."""
+    """The nodes among which a majority is counted; ``ids`` are the known ones, ``size`` is the number of all voters."""
 
     ids: frozenset[bytes]
     size: int
@@ -86,15 +87,15 @@ class Overlay:
     """The contacts of a node.
 
     A contact heard within the last ``max_silence`` seconds keeps its place in a full bucket without a ping.
-    ``on_new_contact`` and ``on_lost`` are called with contacts that appear and disappear.  ``on_named`` is called with
-    each contact in an answer and the contact that sent the answer.
+    ``on_new_contact`` and ``on_lost`` are called with contacts that appear and disappear.  ``on_named`` is called for
+    each contact that an answer contains, with this contact and the contact that sent the answer.
 
     ``Membership`` and ``LivenessProber`` set the following attributes.  ``has_all_members``: all members of the team
     are known.  ``is_large``: there are too many members for complete knowledge.  ``has_found_neighbours``: this node
     has looked up its neighbours, so if it knows few nodes, the network has few nodes.
 
-    In a large network the routing table is used.  The member table then contains only contacts that have no place in
-    the routing table, and only as long as this node knows few contacts.
+    In a large network the routing table is used.  The member table then contains only contacts for which the routing
+    table has no space, and only as long as this node knows few contacts.
     """
 
     def __init__(
@@ -255,7 +256,7 @@ class Overlay:
     async def run_lookup(
         self, lookup: Lookup, visit: Callable[[Contact], Any], is_done: Callable[[], bool] = lambda: False
     ) -> None:
-        """Ask the contacts that ``lookup`` returns, alpha in parallel plus one for each slow contact, until it ends."""
+        """Run ``lookup``: ask the contacts that it returns, alpha in parallel plus one for each slow contact."""
         done: Deferred[None] = Deferred()
 
         def step() -> None:
@@ -312,9 +313,9 @@ class Overlay:
     async def _request_contacts(self, contact: Contact, target: bytes) -> Any:
         """Request the contacts that ``contact`` knows near ``target``.
 
-        If a datagram of the contact arrived during an unanswered request, the request is repeated once.  The reason:
-        when several lookups ask an unknown contact at the same moment, only one request is sent inside the handshake,
-        and the other requests may time out after it.
+        If a datagram of the contact arrived during an unanswered request, the request is repeated once.  The reason is
+        that, when several lookups ask an unknown contact at the same moment, only one request is sent inside the
+        handshake.  The requests that wait for the handshake may time out.
         """
         began = self._clock.seconds()
         try:
@@ -327,8 +328,8 @@ class Overlay:
     def hedge_delay(self) -> float:
         """Return the seconds after which other contacts are asked in parallel with a contact that has not answered.
 
-        The delay is measured over all contacts, because a single contact has few and old samples.  For a distant
-        contact, which always exceeds the delay, this costs only a few more requests.
+        The delay is measured over all contacts, because a single contact has few and old samples.  A distant contact
+        always exceeds this delay, which costs only a few more requests.
         """
         if self.is_large:  # unknown contacts need a handshake, and may be distant
             guess = self._endpoint.peers.initial_timeout
@@ -407,7 +408,8 @@ class Overlay:
             contact.node_id == self.own_id
             or now - self._checked_at.get(contact.node_id, -CHECK_INTERVAL_S) < CHECK_INTERVAL_S
         ):
-            # in a large network two nodes without a place in each other's table must not ping each other forever
+            # in a large network, two nodes must not ping each other forever if neither has space for the other in its
+            # routing table
             return
         if len(self._checked_at) > MAX_FOUND:
             self._checked_at.clear()
@@ -456,8 +458,9 @@ class Overlay:
     def record_miss(self, contact: Contact, is_over: bool = False) -> None:
         """Record that ``contact`` did not answer; ``is_over``: delete it immediately.
 
-        In a large network one miss makes a distant contact stale.  Other contacts of the same range are equivalent, and
-        a lookup that waits for a failed node is more expensive than a lookup that skips a live node.
+        In a large network one miss makes a distant contact stale.  Any contact in the same range of ids can replace a
+        distant contact, and a lookup that waits for a failed node is more expensive than a lookup that skips a live
+        node.
         """
         now = self._clock.seconds()
         count, at = self._misses.get(contact.node_id, (0, -MISS_INTERVAL_S))

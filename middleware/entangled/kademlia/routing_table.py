@@ -25,7 +25,7 @@ STALE_AFTER = 3
 DROPPED_AFTER = 5
 """The number of successive misses after which a contact is deleted even if there is no replacement."""
 PING_INTERVAL_S = 1.0
-"""The seconds for which a contact is not returned for a ping again after it answered or was returned for a ping."""
+"""After a contact answered or was returned for a ping, it is not returned for a ping for this number of seconds."""
 
 
 @dataclass(slots=True)
@@ -44,7 +44,7 @@ class _Entry:
 
 @dataclass(slots=True)
 class _Bucket:
-    """One k-bucket, of the ids from ``low`` to below ``high``; both dicts begin with the least recently seen."""
+    """One k-bucket of the ids from ``low`` to below ``high``; both dicts begin with the least recently seen contact."""
 
     low: int
     high: int
@@ -109,8 +109,8 @@ class RoutingTable:
     def record_contact(self, contact: Contact, now: float) -> Contact | None:
         """Record that ``contact`` has proved its key and its address.
 
-        Returns the least recently seen contact of a full bucket: the caller pings it, and if it does not answer
-        (``record_miss``) the new contact replaces it.  A known contact at a new address has moved there.
+        Returns the least recently seen contact of a full bucket: the caller pings the returned contact; if it does not
+        answer (``record_miss``), the new contact replaces it.  A known contact at a new address has moved there.
         """
         if contact.node_id == self._own_id:
             return None

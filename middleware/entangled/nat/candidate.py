@@ -45,7 +45,7 @@ def parse_candidates(fields: object) -> list[Address]:
 
 
 def is_possible(address: Address) -> bool:
-    """Return whether a peer can have this address; names, multicast and unspecified addresses are excluded."""
+    """Return whether a peer can have this address; host names, multicast and unspecified addresses are excluded."""
     ip = _parse_ip(address.host)
     if ip is None or not 0 < address.port < 65536:
         return False
@@ -61,8 +61,8 @@ def is_loopback(host: str) -> bool:
 def is_near(host: str, own: str, is_translated: bool = False) -> bool:
     """Return whether ``host`` and ``own`` are one machine or neighbours in a private network, without NAT in between.
 
-    If this node ``is_translated`` by a router, its private network is small and may be part of a larger network with
-    the same range.  Then only addresses that differ in no more than the last byte are neighbours.
+    If this node ``is_translated`` (a router translates its address), its private network is small and may be part of a
+    larger network with the same range.  Then only addresses that differ in no more than the last byte are neighbours.
     """
     one, other = _parse_numeric(host), _parse_numeric(own)
     if one is None or other is None or one.version != other.version:

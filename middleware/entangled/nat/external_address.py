@@ -26,8 +26,8 @@ NOTIFY_DELAY_S, NOTIFY_INTERVAL_S = 0.1, 1.0
 seconds.  After the delay the notification is sent only if the address has not changed back: a replayed datagram changes
 an address only briefly."""
 KEEP_ALIVE_S = 2.5
-"""If all possible introducers were silent for these seconds, this node sends one of them a datagram.  The datagram
-keeps this node's NAT mapping open and informs the introducer of this node's current address."""
+"""If all possible introducers were silent for this number of seconds, this node sends a datagram to one of them.  The
+datagram keeps this node's NAT mapping open and informs the introducer of this node's current address."""
 
 
 class ExternalAddresses:
@@ -117,7 +117,7 @@ class ExternalAddresses:
             self._endpoint.notify(contact, "reach.seen", contact.address.host, contact.address.port)
 
     def keep_mapping_open(self, now: float) -> None:
-        """Send a datagram to a possible introducer, to keep the NAT mapping open, if all were silent recently."""
+        """If all possible introducers were silent recently, send one a datagram to keep the NAT mapping open."""
         if now <= self._quiet_until:
             return
         sessions = [s for c in self._contacts() if (s := self._peers.find_direct_session(c.public)) is not None]

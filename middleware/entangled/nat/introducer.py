@@ -21,7 +21,8 @@ from middleware.entangled.token_bucket import TokenBucket
 from middleware.entangled.wire.endpoint import Endpoint
 
 USUAL_PORTS = 0
-"""The order in which both peers send INITs from their usual ports; in all other orders they use additional ports."""
+"""The number of the order of sending in which both peers send INITs from their usual ports.  In all other orders, they
+use additional ports."""
 REQUEST_TIMEOUT_S = 1.0
 """The timeout of a request in seconds."""
 INTRODUCTIONS_PER_S = 20.0
@@ -49,7 +50,7 @@ class IntroductionLimits:
         return self._take_token("introduce", requester, INTRODUCTIONS_PER_S, 2 * INTRODUCTIONS_PER_S)
 
     def may_meet(self, introducer: bytes) -> bool:
-        """Return whether that peer may cause another attempt of this node; if so, count this attempt."""
+        """Return whether that peer may cause another connection attempt by this node; if so, count this attempt."""
         return self._take_token("meet", introducer, ATTEMPTS_PER_S, ATTEMPT_BURST)
 
     def record_introducer(self, public: bytes, introducer: bytes) -> None:

@@ -8,7 +8,7 @@ from middleware.entangled.wire.peer import MAX_PEERS, Peers
 from middleware.entangled.wire.session import Session
 
 LIVE_S = 20.0
-"""A peer is asked for help only if its latest datagram arrived within these seconds."""
+"""A peer is asked for help only if its latest datagram arrived within this number of seconds."""
 MAX_KNOWN = 1024
 """The number of peers for which introducers, relays and similar state are remembered."""
 

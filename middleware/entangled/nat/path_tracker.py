@@ -1,4 +1,4 @@
-"""Track the path to each peer, its duration, and the paths through NAT mappings."""
+"""Track the path to each peer, how long it has been in use, and which paths use NAT mappings."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from middleware.entangled.wire.peer import Peers
 from middleware.entangled.wire.session import Session
 
 EXTENSION_S = 5.0
-"""The seconds for which a handshake continues while other nodes help."""
+"""The seconds for which a handshake continues while introducers and relays help."""
 MAX_REOPENED = 64
 """The maximum number of sessions that are reopened when this node's address changes."""
 MAX_PORTS = 16
@@ -118,7 +118,7 @@ class PathTracker:
         if noted is None and len(peer.sessions) > 1:
             former = peer.sessions[-2]
             noted = (self._classify(former), former.opened_at)
-        if noted is not None or kind == "punched":  # otherwise the kind of path follows from the session
+        if noted is not None or kind == "punched":  # for any other path, the session determines the kind
             since = noted[1] if noted is not None and noted[0] == kind else self._clock.seconds()
             put_bounded(self._path_kinds, public, (kind, since), MAX_KNOWN)
 

@@ -26,7 +26,7 @@ PAIR_RATE, PAIR_BURST = 8_000.0, 65_536.0
 ALL_RATE, ALL_BURST = 128_000.0, 524_288.0
 MAX_PAIRS = 256
 ONE_SIDED_S = 120.0
-"""The seconds for which one of two peers may send to the other without receiving from it."""
+"""The seconds for which one of two peers may send to the other although the other sends nothing back."""
 
 
 @dataclass(slots=True)

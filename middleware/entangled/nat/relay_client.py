@@ -48,7 +48,7 @@ class RelayClient:
         return list(self._relays.get(to, ()))
 
     def find_contacts(self, to: bytes) -> list[Contact]:
-        """Return the contacts of the relays to the node with that id that this node reaches directly."""
+        """Return the contacts of those relays to the node with that id that this node reaches directly."""
         sessions = [self._endpoint.peers.find_direct_session(public) for public in self.relay_keys(to)]
         return [session.contact for session in sessions if session is not None]
 

@@ -46,12 +46,12 @@ from middleware.entangled.wire.peer import OutgoingHandshake, Peer
 from middleware.entangled.wire.session import Session
 
 NEW_PORT_AFTER_S = 0.5
-"""The age in seconds from which a handshake is also tried from an additional local port."""
+"""From this age in seconds, a handshake is also tried from an additional local port."""
 RELAY_AFTER_S = 0.9
-"""The age in seconds from which a handshake is also sent through relays.  At this age most direct paths have been
-found, and a request with the default timeout of 1.5 s can still be answered."""
+"""From this age in seconds, a handshake is also sent through relays.  By then most direct paths have been found, and a
+request with the default timeout of 1.5 s can still be answered."""
 PATH_WORKS_S = 3.0
-"""The path to a peer is not changed within these seconds after the latest datagram of the peer."""
+"""The path to a peer is not changed for this number of seconds after the latest datagram of the peer."""
 SIMULTANEOUS = 1
 OWN_DELAYS_S = {3: 0.15, 5: 0.7}
 PEER_DELAYS_S = {2: 0.15, 4: 0.7}
@@ -69,7 +69,7 @@ REOPEN_INTERVAL_S = 2.0
 class _Attempt:
     """The search for a path to one peer.
 
-    It records which nodes were asked, which of them know the peer, and which further nodes they suggested.
+    It records which nodes were asked, which of these nodes know the peer, and which further nodes were suggested.
     """
 
     peer: Peer
@@ -135,8 +135,8 @@ class NatTraversal:
 
     @cached_property
     def _rng(self) -> random.Random:
-        # Separate from the endpoint's generator, to leave the endpoint's random numbers unchanged; it only distributes
-        # load.
+        # This generator is separate from the endpoint's generator, whose random numbers thus stay the same; it only
+        # distributes load.
         return random.Random(int.from_bytes(self._own_id))
 
     def _forget(self, public: bytes) -> None:
@@ -157,7 +157,7 @@ class NatTraversal:
         self._background.later(max(0.0, since + RELAY_AFTER_S - now), self._send_by_relay, opening)
         await self._ask_introducers(attempt)
         if not attempt.introducers and self._is_pending(opening):
-            await self._ask_introducers(attempt)  # other introducers, or the nodes that the first introducers suggested
+            await self._ask_introducers(attempt)  # ask more introducers, or the nodes that the first ones suggested
         if not self._is_pending(opening):
             return
         if not attempt.introducers:

@@ -12,7 +12,8 @@ from middleware.entangled.wire.peer import Peer, Peers
 RETRY_INTERVALS_S = (1.0, 2.0, 5.0, 5.0, 15.0, 60.0)
 """The seconds between attempts of a relayed pair to connect directly; the last interval is repeated.
 
-There are as many short intervals as orders of sending from additional ports, because possibly only one order succeeds.
+There is one short interval for each order of sending from additional ports, because possibly only one of the orders
+succeeds.
 """
 TURN_DELAY_S = 0.5
 """The seconds by which one of the two peers delays its attempt, so that normally only the other peer tries."""
@@ -39,7 +40,7 @@ class PathUpgrades:
         return len(self._upgrades)
 
     def add(self, public: bytes, is_behind: bool, now: float) -> None:
-        """Schedule direct attempts to a peer; with ``is_behind`` this node starts later than the peer."""
+        """Schedule direct attempts to a peer; with ``is_behind``, this node tries later than the peer."""
         if public not in self._upgrades:
             put_bounded(
                 self._upgrades,

@@ -108,7 +108,7 @@ class _Family:
     def join(self, interface: Interface) -> None:
         """Join the group on ``interface``."""
         if self._receiving_port is not None:
-            # Fails if the interface is a member already, or has no addresses of this family.
+            # This fails if the interface has already joined the group, or has no address of this family.
             with suppress(OSError):
                 self._join(self._receiving_port.socket, interface.index)
 

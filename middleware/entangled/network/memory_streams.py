@@ -1,8 +1,9 @@
 """Simulate the byte streams between many nodes in one process, in place of ``tcp``.
 
 A stream delivers bytes in order, after ``delay_s`` seconds, at most ``rate`` bytes per second.  Further bytes wait in
-the stream's buffer, and a producer is paused while the buffer is full.  Neither end notices a cut: bytes wait, as in
-TCP.  The bytes of a single stalled stream (``Pipe.is_stalled``) also wait; this stream retransmits without success.
+the stream's buffer, and a producer is paused while the buffer is full.  If a path is cut, neither end notices this: the
+bytes wait, as in TCP.  A single stream can also be stalled (``Pipe.is_stalled``); its bytes wait, and it retransmits
+without success.
 """
 
 from __future__ import annotations

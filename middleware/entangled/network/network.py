@@ -12,8 +12,8 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 MAX_DATAGRAM_BYTES = 1400
 MAX_RELAYED_BYTES = 1452
-"""The maximum length of a relayed datagram, which contains another datagram: 1500 bytes minus the headers of IPv6 and
-UDP."""
+"""The maximum length of a relayed datagram, which contains the datagram that is relayed: 1500 bytes minus the headers
+of IPv6 and UDP."""
 ANY_HOST = "*"
 """The host that means every interface of both address families."""
 MAX_ASSIGNED = 1024
@@ -51,7 +51,7 @@ def is_relayed(address: Address) -> bool:
 
 
 def pack_address(address: Address) -> bytes:
-    """Encode an address in 18 bytes; zero if its host is not an IP address."""
+    """Encode an address in 18 bytes, which are zero if its host is not an IP address."""
     host, port = address
     try:
         if ":" in host:

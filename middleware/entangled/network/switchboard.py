@@ -230,7 +230,7 @@ class Switchboard:
             self._cuts.add((b, a))
 
     def partition(self, *groups: Iterable[Address]) -> None:
-        """Block datagrams between ``groups``; the addresses that are in no group form a further group."""
+        """Block datagrams between ``groups``; all addresses that are in no group form one further group."""
         self._sides = {address: number for number, group in enumerate(groups, start=1) for address in group}
 
     def heal(self) -> None:

@@ -40,10 +40,10 @@ CHECK_INTERVAL_S = 1.0
 ACCEPT_TIMEOUT_S = 8.0
 """The time in seconds from the connection to the end of the TLS and WebSocket handshakes."""
 DIAL_TIMEOUT_S = 12.0
-"""The same time for the dialling side, whose connection may go through a proxy."""
+"""The same time in seconds for the dialling side; it is longer, because the connection may go through a proxy."""
 UNANSWERED_TIMEOUT_S = 10.0
-"""The time in seconds without an answer after which a client is considered a non-member, because the wire protocol
-answers only members."""
+"""If this node has sent no answer to a client within this time in seconds, the client is considered a non-member,
+because the wire protocol answers only members."""
 IDLE_TIMEOUT_S = 60.0
 """The time in seconds without traffic after which the dialling side closes a tunnel."""
 MAX_TOTAL_CONNECTIONS = 256
@@ -51,7 +51,7 @@ MAX_HANDSHAKES = 64
 """The maximum number of connections that are not open yet; if there are more, the oldest is closed."""
 MAX_PER_HOST = 32
 """The maximum number of connections from one address to which the node has sent nothing.  A team behind one NAT shares
-an address, so the limit for all connections from one address is the number of connections of this many tunnels."""
+an address; therefore the limit of all connections from one address is the number that this many tunnels need."""
 MIN_REDIAL_S, MAX_REDIAL_S = 0.5, 10.0
 """The first and the longest delay in seconds before a URL that failed is dialled again."""
 
@@ -147,7 +147,7 @@ class TunnelNetwork:
     # -- called by the connections ----------------------------------------------------------------------------------
 
     def on_connection_open(self, connection: TunnelConnection) -> bool:
-        """Register a connection that is open; return False if there are too many from its address."""
+        """Register a connection that has opened; return False if there are too many connections from its address."""
         if self._is_plain and connection.address not in self._targets:
             host = _address_block(connection.socket.forwarded) or connection.host
             if connection.socket.forwarded and self._is_crowded(host):
@@ -268,8 +268,8 @@ class TunnelNetwork:
     def _accept(self, host: str) -> TunnelConnection | None:
         """Return a connection for a client at ``host``; None if there are too many."""
         place = _address_block(host)
-        # All clients of a reverse proxy share its address; they are counted when the proxy has sent the client's
-        # address.
+        # All clients of a reverse proxy share the address of the proxy. So each client is counted only when the proxy
+        # has sent the address of the client.
         if self._receiver is None or (not self._is_plain and self._is_crowded(place)):
             self.counters["crowded"] += 1
             return None

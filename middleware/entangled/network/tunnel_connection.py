@@ -25,12 +25,13 @@ SHORT_BYTES = 300
 """The length limit of short datagrams: heartbeats, receipts, discovery and most requests; full fragments have 1400
 bytes."""
 MAX_QUEUED_BYTES, MAX_LONG_QUEUED_BYTES = 40 * 1024, 32 * 1024
-"""The bytes in the queues up to which a short datagram, and a long datagram, is accepted."""
+"""A short datagram is accepted up to the first number of bytes in the queues, a long datagram up to the second
+number."""
 MAX_SEND_BUFFER_BYTES = 16 * 1024
 """The bytes that may wait in the transport, where short datagrams cannot overtake long ones.  Queues and transport
 together buffer less than 64 KiB."""
 QUIET_S, IDLE_S = 5.0, 20.0
-"""The silence in seconds after which a connection is pinged: first if datagrams are sent on it, second if not."""
+"""The silence in seconds after which a connection is pinged: if datagrams are sent on it, and if none are sent."""
 PONG_S = 5.0
 """The time in seconds without a pong after which the peer is considered unreachable although the connection is open."""
 STALL_S = 30.0

@@ -25,11 +25,11 @@ STALLED_S = 0.3
 REPLACE_STALLED_S = 1.5
 """The time in seconds after which a stalled stream is replaced by a new one, if another stream makes progress."""
 LOSSY_RETRANSMISSIONS = 2
-"""The number of retransmissions that indicates a lossy path, if they occur before the stream is open."""
+"""If this number of retransmissions occurs before the stream is open, the path is considered lossy."""
 REDUNDANCY_S = 30.0
 """The time in seconds for which a tunnel has several connections after a stall."""
 DIAL_NEXT_S = 1.2
-"""The time in seconds after which another connection is dialled if none opens."""
+"""If no connection opens within this time in seconds, another connection is dialled."""
 REDIAL_DELAY_S = 1.0
 """The minimum time in seconds between the loss of a connection and the next dialling, if the tunnel has other
 connections."""
@@ -98,7 +98,7 @@ class TunnelConnections:
         return sent > 0
 
     def order_by_progress(self, now: float) -> list[TunnelConnection]:
-        """Return the open connections: with progress first, and then in the order of the bytes that they buffer."""
+        """Return the open connections: those with progress first, and of equals the one with fewer buffered bytes."""
         connections = [connection for connection in self.connections if connection.is_open]
         for connection in connections:
             self._measure_progress(connection, now)

@@ -152,7 +152,7 @@ class UdpNetwork:
     # -- private ----------------------------------------------------------------------------------------------------
 
     def _open(self, number: int | None, host: str, wanted: int) -> int:
-        """Open a port under the key ``number``, or under its port number if None; return its port number."""
+        """Open a port, with the key ``number`` (None: its port number is the key); return its port number."""
         protocol = _Protocol(self, number or 0)
         try:
             # One byte more than the maximum, to detect oversized datagrams.
@@ -195,13 +195,14 @@ class UdpNetwork:
                 maybeDeferred(port.stopListening)
 
     def _own_host(self) -> str:
-        # Any address outside this machine is suitable, because nothing is sent to it (RFC 5737 and 3849).
+        # Any address outside this machine is suitable, because nothing is sent; these are for documentation (RFC 5737,
+        # 3849).
         six = self._host == "::"
         own = [host for host in _list_own_hosts() if (":" in host) == six]
         return _ask_route("2001:db8::1" if six else "192.0.2.1") or next(iter(own), "::1" if six else "127.0.0.1")
 
     def _find_route(self, host: str, ask: Callable[[], str]) -> str:
-        """Return a cached route to ``host``, calling ``ask`` again after ``ROUTE_CACHE_S``."""
+        """Return the route to ``host`` from the cache; if it is older than ``ROUTE_CACHE_S``, call ``ask`` again."""
         found, asked_at = self._routes.get(host, ("", -math.inf))
         now = self._reactor.seconds()
         if now - asked_at > ROUTE_CACHE_S:

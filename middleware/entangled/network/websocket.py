@@ -26,7 +26,7 @@ class WebSocket(WebSocketEnd):
             request = Request(url.authority, url.path, extra_headers=named, subprotocols=[SUBPROTOCOL])
         super().__init__(MAX_PAYLOAD_BYTES, request, takes_text=False)
         self.forwarded = ""
-        """The last address in ``X-Forwarded-For``, which a reverse proxy in front of the server adds."""
+        """The last address in the header field ``X-Forwarded-For``; a reverse proxy in front of the server adds it."""
         self.token = token
         """The identifier of the client's tunnel."""
 

@@ -159,15 +159,15 @@ class Acceptor(Generic[Key]):
         """Promise to accept nothing under a lower ballot, and reserve the promise for ``reserve`` seconds.
 
         ``ttl`` is the duration in seconds of the lease that the proposer will request.  A ballot with counter 0 only
-        reads, without a promise.  Otherwise an acceptor that missed a renewal could promise to a reader, and its vote
-        would be lost to the holder.
+        reads, without a promise.  If reads were promises, an acceptor that missed a renewal could promise to a reader,
+        and the holder would lose its vote.
         """
         register, reply = self._decide(key, _Request(Event.PREPARE, ballot, now, configuration, ttl=ttl))
         if reply.kind in (ReplyKind.GRANTED, ReplyKind.SEALED):
             register.touched_at = now
             if ballot.counter > 0:
                 is_new = ballot > register.promised or reserve != register.reserve
-                register.promised = ballot  # P1
+                register.promised = ballot  # P1: a promised ballot never decreases
                 register.reserve, register.reserved_until = reserve, now + reserve
                 if is_new:  # D1: durable before the reply
                     self.log.write(key)
@@ -200,8 +200,8 @@ class Acceptor(Generic[Key]):
     ) -> Reply:
         """Accept ``value`` permanently.
 
-        With ``gives_back``, the proposer is the holder, its device is at rest, and the value is accepted during its own
-        lease.  ``token`` is the highest token that the proposer knows.
+        ``gives_back`` means that the proposer holds the lease, its device is at rest, and it gives up the lease with
+        this request.  ``token`` is the highest token that the proposer knows.
         """
         register, reply = self._decide(key, _Request(Event.ACCEPT, ballot, now, configuration, token, 0.0, gives_back))
         if reply.kind is not ReplyKind.GRANTED:
@@ -211,7 +211,7 @@ class Acceptor(Generic[Key]):
         register.value, register.touched_at = value, now
         register.reserve, register.reserved_until = self._settings.completion_s, now + self._settings.completion_s
         register.record_token(token)
-        if is_new:  # D1
+        if is_new:  # D1: durable before the reply
             self.log.write(key)
         return self._reply(ReplyKind.GRANTED, register, now)
 
@@ -236,24 +236,24 @@ class Acceptor(Generic[Key]):
         if ballot.is_same_life(register.holder, self.log.codec.lives) and register.holder <= ballot:
             register.lease_until = min(register.lease_until, now + rest)
             register.holder = register.holder if register.lease_until > now else NO_BALLOT
-        self.log.write(key)  # D1
+        self.log.write(key)  # D1: durable before the reply
         return self._reply(ReplyKind.GRANTED, register, now)
 
     def close(self, key: Key, proposer: ProposerName, configuration: int, token: int, now: float) -> Reply:
         """Close the register, so that it grants nothing; ``remaining`` is the time in which a holder may still act.
 
-        A proposer proves its right to close the register by the token that it was granted here, even if it has already
-        released the lease; callers without a lease pass token 0.  If the reply indicates that the configuration has
-        changed, or may have changed, the caller must also close the next configuration.
+        A proposer proves its right to close the register by the token that this acceptor granted to it; the proposer
+        may already have released the lease.  Callers without a lease pass token 0.  If the reply indicates that the
+        configuration has changed, or may have changed, the caller must also close the next configuration.
         """
         register = self._get_or_enter(key, now)
         if register is None:
             return NO_ROOM_REPLY
-        if token and (register.token, register.grantee) != (token, proposer):  # C5: it must have been granted
+        if token and (register.token, register.grantee) != (token, proposer):  # C5: this acceptor granted the token
             return self._reply(ReplyKind.OUTBID if token < register.token else ReplyKind.BEHIND, register, now)
         if not register.is_closed:
             register.is_closed, register.touched_at = True, now
-            self.log.write(key)  # D1
+            self.log.write(key)  # D1: durable before the reply
         has_moved, is_sealed = configuration < register.configuration, register.accepted != NO_BALLOT
         reply = self._reply(
             ReplyKind.MOVED if has_moved else ReplyKind.SEALED if is_sealed else ReplyKind.OVER, register, now
@@ -286,7 +286,7 @@ class Acceptor(Generic[Key]):
             register.touched_at, register.proof = now, proof
             register.record_token(token, ballot.proposer)
             register.ceiling = Ceiling(now, self.log.codec.lives, register.promised.counter, register.token)
-            self.log.write(key)  # D1
+            self.log.write(key)  # D1: durable before the reply
         return self._reply(
             ReplyKind.GRANTED if configuration == register.configuration else ReplyKind.MOVED, register, now
         )
@@ -324,7 +324,7 @@ class Acceptor(Generic[Key]):
                 if is_held
                 else BallotRelation.FREE
             )
-        if configuration != register.configuration:  # C3
+        if configuration != register.configuration:  # C3: only the current configuration
             return BallotRelation.BEHIND if configuration > register.configuration else BallotRelation.MOVED
         if is_held and (ballot.counter == 0 or left > self._settings.early_share * register.ttl):
             return BallotRelation.HELD
@@ -332,11 +332,11 @@ class Acceptor(Generic[Key]):
             is_lower_token = token < register.token or (token == register.token and not is_own)
             if event is Event.LEASE and is_lower_token:  # T2: a token belongs to one holder
                 return BallotRelation.LOWER
-            if ballot <= register.released:  # B3
+            if ballot <= register.released:  # B3: released ballots get nothing
                 return BallotRelation.LOWER
-            if not register.ceiling.admits(now, ballot.counter, token):  # N1
+            if not register.ceiling.admits(now, ballot.counter, token):  # N1: numbers have a ceiling
                 return BallotRelation.LOWER
-            if ballot < register.promised:  # P1
+            if ballot < register.promised:  # P1: lower ballots get nothing
                 extends = left > 0.0 and is_own and not register.is_released and token == register.token
                 return BallotRelation.OVERTAKEN if extends else BallotRelation.LOWER
         if left > 0.0 and not (gives_back and is_own):

@@ -15,7 +15,7 @@ from middleware.entangled.quorum.register import Register
 
 MAX_REGISTERS = 4096
 MAX_SEARCHED = 256
-"""The number of oldest registers that are examined for eviction; examining all of them would take too long."""
+"""The number of the oldest registers that are examined for eviction; to examine all registers would take too long."""
 
 Key = TypeVar("Key", bound=Hashable)
 
@@ -42,9 +42,9 @@ class NoteStore(Protocol):
 class Codec(Generic[Key]):
     """The encoding of the registers of one use as notes; decoders return None instead of raising.
 
-    ``name`` is the format of the names of the ``buckets``; ``lowest_name`` is a name below all names of proposers.  The
-    ballot counters of two processes of one proposer differ modulo ``lives`` (1 if the processes have different names).
-    ``unpack`` also returns whether the note was complete.
+    ``name`` is the format string of the names of the ``buckets``.  ``lowest_name`` is a name below all names of
+    proposers.  The counters of a proposer's ballots differ modulo ``lives`` after a restart of its process; ``lives``
+    is 1 if each process has a new name.  ``unpack`` also returns whether the note was complete.
     """
 
     floor_name: str

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 MAX_NUMBER = 2**62
-"""Exclusive upper bound of counters, tokens and configurations."""
+"""Counters, tokens and configurations are below this number."""
 FIRST_CONFIGURATION = 1
 """The first configuration of a register."""
 INITIAL_CEILING = 2**32
@@ -15,11 +15,11 @@ CEILING_RATE_PER_S = 2**10
 above its ceiling.  The ceiling starts at ``INITIAL_CEILING``, or at the acceptor's own number at its start if that is
 higher.  A proposer cannot exhaust the numbers: the 2**42 attempts last for 136 years, and there are more tokens."""
 MAX_UNCONFIRMED = INITIAL_CEILING // 2
-"""A proposer believes a higher number only if two acceptors report it, because a single acceptor may have invented
-it."""
+"""A proposer accepts a number above this limit only if two acceptors report it, because a single acceptor may have
+invented it."""
 
 ProposerName = Any
-"""The name of a proposer: ``str`` or ``bytes``, the same in all ballots of a register."""
+"""The name of a proposer is of type ``str`` or ``bytes``; all ballots of a register use the same type."""
 
 
 class Ballot(NamedTuple):
@@ -59,7 +59,10 @@ def is_number(value: object) -> bool:
 
 
 def highest_credible(numbers: Iterable[int], size: int) -> int:
-    """Return the highest of ``numbers``, sent by a quorum of ``size``, that no single member can have invented."""
+    """Return the highest credible one of the ``numbers`` that members of a quorum of ``size`` reported.
+
+    A number is credible if no single member can have invented it.
+    """
     descending = sorted(numbers, reverse=True)
     witnessed = descending[1:] if size > 2 else descending
     return max([*witnessed[:1], *(number for number in descending if number <= MAX_UNCONFIRMED)], default=0)

@@ -74,7 +74,7 @@ async def decide(
         outcome = await prepare(ballot)
         counter = max(ballot.counter, outcome.counter)
         if outcome.result is Result.WON:
-            chosen = value if outcome.value is None else outcome.value  # A2
+            chosen = value if outcome.value is None else outcome.value  # A2: an accepted value takes precedence
             if chosen is None:
                 return ballot, None
             outcome = await accept(ballot, chosen)

@@ -57,8 +57,8 @@ class Register:
     is the ballot of the lease, granted for ``ttl`` seconds, until ``lease_until``.  ``released`` is the highest
     released ballot.  ``token`` is the fencing token; ``grantee`` is the proposer to which this acceptor granted it, or
     empty if other acceptors reported the token.  ``value`` was accepted under ``accepted``; if that is ``NO_BALLOT``,
-    ``value`` is the newest configuration known here and ``proof`` its certificate.  Times are on the clock of one
-    process and are not stored.
+    ``value`` is the newest configuration that this acceptor knows, and ``proof`` is the certificate of that
+    configuration.  Times are on the clock of one process and are not stored.
     """
 
     ceiling: Ceiling

@@ -15,8 +15,8 @@ from middleware.entangled.quorum.ballot import NO_BALLOT, majority
 from middleware.entangled.quorum.register import Reply, ReplyKind
 
 MIN_TRIES = 3
-"""The minimum number of requests to a member.  The round needs only a majority, but a member that missed a renewal may
-promise to another proposer."""
+"""The minimum number of requests to a silent member.  A majority would be enough for the round, but a member that
+missed a renewal may promise to another proposer."""
 RETRY_INTERVAL_S = 0.1
 """Seconds between two requests to a member that has not answered."""
 NEWS_INTERVAL_S = 0.03
@@ -25,13 +25,14 @@ MIN_PAUSE_S = 0.005
 """Minimum seconds before the next request to a member with a lease about to expire."""
 
 Decode = Callable[[int, object], "Sequence[Reply | None] | None"]
-"""Called with a member's place and answer; returns one reply per tally, or None if the answer is invalid."""
+"""Called with a member's place (its index) and answer; returns one reply per tally, or None if the answer is
+invalid."""
 
 
 class Tally:
     """The replies of a quorum of ``size`` members about one register; replies of these ``kinds`` agree to the request.
 
-    The place of a member is its index in the list of members.
+    The *place* of a member is its index in the list of members.
     """
 
     def __init__(self, size: int, kinds: tuple[ReplyKind, ...] = (ReplyKind.GRANTED,)) -> None:
@@ -39,7 +40,7 @@ class Tally:
         self.kinds = kinds
         self.size = size
         self._unreachable: set[int] = set()
-        self.needed = majority(size)  # Q1
+        self.needed = majority(size)  # Q1: two majorities share a member
 
     def add(self, place: int, reply: Reply | None) -> None:
         """Add the reply of one member, None if it is unreachable; each member is counted once (Q1)."""
@@ -68,7 +69,7 @@ class Tally:
         """The value that a majority accepted under one ballot; None if there is none."""
         accepted = Counter(reply.accepted for reply in self.replies.values() if reply.accepted != NO_BALLOT)
         ballot, count = max(accepted.items(), key=lambda item: item[1], default=(NO_BALLOT, 0))
-        if count < self.needed:  # A3
+        if count < self.needed:  # A3: a majority chooses the value
             return None
         return next(reply.value for reply in self.replies.values() if reply.accepted == ballot)
 
@@ -76,7 +77,7 @@ class Tally:
     def value_to_complete(self) -> Any:
         """The value that must be proposed: accepted under the highest ballot among agreeing members; or None."""
         accepted = [reply for place in self.agreeing_places if (reply := self.replies[place]).accepted != NO_BALLOT]
-        return max(accepted, key=lambda reply: reply.accepted).value if accepted else None  # A2
+        return max(accepted, key=lambda reply: reply.accepted).value if accepted else None  # A2: the highest
 
     @property
     def is_decided(self) -> bool:
@@ -85,14 +86,14 @@ class Tally:
 
 
 class Round:
-    """One request to all members; fires ``outcome`` with this round as soon as each of its ``tallies`` is decided.
+    """One request to all members; ``outcome`` fires with this round as soon as each of its ``tallies`` is decided.
 
-    ``ask`` sends the request to the member at a place.  If another proposer's lease at a member ends within ``short``
-    seconds, the request is repeated when the lease ends, or earlier if that takes long.  ``outcome`` also fires,
-    undecided, when all members have answered, after ``timeout_s`` seconds, and shortly after a majority has answered.
-    A silent member is asked every ``RETRY_INTERVAL_S`` seconds until the round is decided, and at least ``MIN_TRIES``
-    times.  With ``single`` the round sends one request to each member, the transport retransmits the request, and a
-    failure is treated as the member's answer.
+    ``ask`` sends the request to the member at a place.  If a member replies that another proposer's lease ends within
+    ``short`` seconds, the request is repeated at the end of that lease, or earlier if the end is far off.  ``outcome``
+    also fires, undecided, when all members have answered, after ``timeout_s`` seconds, and shortly after a majority has
+    answered.  A silent member is asked every ``RETRY_INTERVAL_S`` seconds until the round is decided, and at least
+    ``MIN_TRIES`` times.  With ``single`` the round sends each member one request, which the transport retransmits; a
+    failed request is treated as the member's answer.
     """
 
     def __init__(

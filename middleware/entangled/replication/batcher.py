@@ -66,7 +66,7 @@ class RecordBatcher:
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _finish_request(self, waiting: Waiting, contact: Contact) -> None:
-        """Send the next request after the last request ended, if records wait."""
+        """If records wait, send the next request, because the last request has ended."""
         if waiting:
             self._background.fork(self._send_next(waiting, contact))
         else:

@@ -11,7 +11,8 @@ from middleware.entangled.record import Record
 MAX_KEYS = 256
 MAX_BYTES = 256 * 1024
 MAX_AGE_S = 60.0
-"""The maximum age of a copy in seconds, at the node next to the closest one.  Each node in between halves the age."""
+"""The maximum age in seconds of a copy at the node that follows the closest ones.  For each further node in between,
+the maximum age is halved."""
 
 
 class PathCache:

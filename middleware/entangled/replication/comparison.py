@@ -30,8 +30,8 @@ MAX_SNAPSHOTS = 8
 MAX_PEERS = 1024
 """The number of peers whose last request is remembered; the oldest is dropped first."""
 SIGNATURE_BITS = 512
-"""The number of bits of a signature.  The requester chooses a random bit, and only records with this bit set in their
-signature are included in a sum of lifetimes."""
+"""The number of bits of a signature.  The requester chooses a random bit; a sum of lifetimes includes only the records
+with this bit set in their signature."""
 
 Mark = tuple[int, bytes]
 """Version of a slot: the record's sequence and the first bytes of its signature; (-1, b"") if empty."""
@@ -60,7 +60,7 @@ class Comparison:
         endpoint.expose("lacking", self._answer_lacking)
 
     def find_shared(self, peer: Contact) -> tuple[list[list[Record]], list[Record]]:
-        """Return the records that both nodes should store, by groups, and the records for the peer only."""
+        """Return the records that both nodes should store, by groups, and those that only the peer should store."""
         groups: list[list[Record]] = [[] for _ in range(GROUPS)]
         extra = []
         if self._members_version != self._overlay.members.version or not self._overlay.is_complete:
@@ -94,7 +94,7 @@ class Comparison:
     # -- requests of peers ---------------------------------------------------------------------------------------------
 
     def _answer_digests(self, peer: Contact, bit: int, sync_state: int) -> list[object]:
-        """Answer DIGESTS: return each group's digest, the number of records for the peer only, and the lifetimes.
+        """Answer DIGESTS: return each group's digest and sum of lifetimes, and the number of records for the peer only.
 
         The two nodes also exchange their sync states.
         """

@@ -41,7 +41,8 @@ LIFETIME_SLACK_S = 60.0
 """Seconds by which the remaining lifetime at another replica must exceed the local remaining lifetime to extend it.
 The slack is needed because the time of a transfer, which may be seconds, is not subtracted from the lifetime."""
 LIFETIME_SUM_SLACK_S = 1800
-"""Seconds by which the sums of lifetimes of a group may differ before the slots of the group are compared."""
+"""If the sums of lifetimes of a group differ by more than this number of seconds, the slots of the group are
+compared."""
 CONTACTS_INTERVAL_S = 0.1
 NEW_NODE_DELAY_S = 1.0
 """Seconds for which a new node may catch up by itself, before this node reconciles with it.  The delay is random, up to
@@ -84,7 +85,8 @@ class Handover:
     def start(self, forgot: bool = False) -> None:
         """Start the periodic reconciliation, and the check for contact to a majority.
 
-        ``forgot``: the node dropped the records of its earlier run, although other nodes may rely on them.
+        ``forgot`` is true if the node dropped the records from before its restart, although other nodes may rely on
+        them.
         """
         self._sync_state.start(forgot)
         self._overlay.members.is_voter = self._sync_state.value != NEVER_SYNCED
@@ -113,7 +115,7 @@ class Handover:
             )
 
     def handle_lost_contact(self, contact: Contact) -> None:
-        """Send the records of a lost node to the node that is now among the closest to their keys."""
+        """Send the records of a lost node to the nodes that are now among the closest to the keys of these records."""
         self._reconciled_at.pop(contact.node_id, None)
         self._comparison.requested_at.pop(contact.node_id, None)
         self._sent_digests.pop(contact.node_id, None)
@@ -152,7 +154,7 @@ class Handover:
         return self._overlay.members.list_live() if self._overlay.is_complete else self._overlay.find_neighbours()
 
     async def _reconcile(self, contact: Contact) -> None:
-        """Exchange with ``contact`` the records that one of the two nodes lacks."""
+        """Exchange records with ``contact``, so that neither node lacks a record that both should store."""
         if contact.node_id in self._reconciling:
             return
         self._reconciling.add(contact.node_id)
@@ -233,7 +235,7 @@ class Handover:
     async def _send_lacking(self, contact: Contact, records: list[Record]) -> None:
         """Send ``contact`` the ``records`` that it lacks; only ``contact`` should store them, not this node.
 
-        Once ``contact`` has all of them, this node asks it again only when the set of these records changes.
+        Once ``contact`` has all these records, this node contacts it again about them only when their set changes.
         """
         digest = digest_of(records)
         if not records or self._sent_digests.get(contact.node_id) == digest:
@@ -255,7 +257,7 @@ class Handover:
                 await self._overlay.ask(contact, "store", [r.pack() for r in page], lives, changes=True)
 
     async def _catch_up(self) -> None:
-        """Reconcile with near nodes until they are enough to guarantee that no acknowledged record is missing."""
+        """Reconcile with as many near nodes as guarantee that no acknowledged record is missing."""
         if self._is_catching_up:
             return
         self._is_catching_up = True
@@ -266,7 +268,7 @@ class Handover:
                     continue
                 began = self._clock.seconds()
                 others = self._near_nodes()
-                # The first nodes have most records, which the other nodes then need not send again.
+                # Most records come from the first nodes; the nodes after them then need not send these records again.
                 reached = [await self._try_reconcile(contact) for contact in others[:FIRST_REPLICAS]]
                 work = [Deferred.fromCoroutine(self._try_reconcile(contact)) for contact in others[FIRST_REPLICAS:]]
                 reached += [await each for each in work]

@@ -38,13 +38,13 @@ REPUBLISH_INTERVAL_S = 3600.0
 republishes a record that no other node has republished for this time."""
 RENEWALS_PER_LEASE = 3
 RENEWAL_TOLERANCE_S = 1e-6
-"""Seconds by which a renewal may be early, to tolerate rounding errors in sums of times."""
+"""A renewal may be this number of seconds early, so that rounding errors in sums of times do no harm."""
 MAX_ATTEMPTS = 3
 UNSYNCED_RETRIES_S = (0.1, 0.2, 0.4, 0.8)
-"""The seconds before each repeated request to a voter that is not synced yet."""
+"""The seconds before the first, second, ... repetition of a request to a voter that is not synced yet."""
 MAX_PARALLEL = 32
-"""The number of own records that are republished at the same time.  With more, all records are republished earlier, but
-other requests are delayed."""
+"""The number of own records that are republished at the same time.  With a higher number, the republication ends
+earlier, but delays other requests."""
 MIN_TWO_WAVES_BYTES = 2**16
 """The size of a value in bytes from which its copies are sent in two waves."""
 SECOND_WAVE_S = 0.5
@@ -171,9 +171,9 @@ class Owner:
     async def put(self, record: Record, concern: ConsistencyLevel = "majority") -> Stored:
         """Store ``record`` at its replicas, as many as ``concern`` requires.
 
-        If the replicas store a record of an earlier run of this node with a higher sequence number, the new record gets
-        a number above that.  Raises ``NotAcknowledged`` if too few replicas answer; the record is stored at the missing
-        replicas when they return.
+        If the replicas store a record with a higher sequence number, which this node wrote before its restart, the new
+        record gets a number above it.  Raises ``NotAcknowledged`` if too few replicas answer; the record is stored at
+        the missing replicas when they return.
         """
         for _ in range(MAX_ATTEMPTS):
             held, newest = await self.store_everywhere(record, concern)
@@ -191,9 +191,9 @@ class Owner:
     async def store_everywhere(self, record: Record, concern: ConsistencyLevel = "majority") -> tuple[int, int]:
         """Store ``record`` at all replicas.
 
-        Returns the number of replicas that stored the record, and the highest conflicting sequence number (0: none).
-        Raises ``NotAcknowledged`` if too few replicas stored it and there was no conflict.  Raises ``Refused`` if the
-        reason is the owner's role or its share of the store.
+        Returns the number of replicas that stored the record, and the highest sequence number of a conflicting record
+        (0: no conflict).  Raises ``NotAcknowledged`` if too few replicas stored the record and there was no conflict.
+        Raises ``Refused`` if the reason is the owner's role or its share of the store.
         """
         if concern != "one":
             await self._overlay.wait_for_members()
@@ -285,7 +285,7 @@ class Owner:
             self._background.fork(self._send(contact, lacking))
 
     def restore(self, record: Record) -> bool:
-        """Store ``record`` again if this node owns it and a late timer let it expire; return whether it is own."""
+        """If this node owns ``record``, store it again, because a late timer let it expire; return whether it does."""
         own = self._own.get(record.slot)
         if own is None:
             return False
@@ -296,7 +296,7 @@ class Owner:
     # -- inside -----------------------------------------------------------------------------------------------------
 
     async def _store_latest(self, contact: Contact, record: Record, left: float | None) -> StoreReply:
-        """Store as ``store_at`` does; if a later record of this run supersedes ``record``, store the later record.
+        """Store ``record`` as ``store_at`` does, or a later record that has replaced it since this node's start.
 
         The reply about the later record is also valid for ``record``, and indicates whether the replica is synced.
         """
@@ -392,8 +392,8 @@ class Owner:
     def _send_renewals(self) -> bool:
         """Renew the own leases that are due: send each replica its lease and the digest of its records.
 
-        If a replica has records with several lease durations, it gets the shortest duration.  Returns whether there are
-        any leases.
+        If a replica has records with different lease durations, it gets the shortest duration.  Returns whether there
+        are any leases.
         """
         now = self._clock.seconds()
         due: set[bytes] = set()
@@ -414,7 +414,7 @@ class Owner:
         return held > 0 or bool(self._list_leased())
 
     def _answer_missing(self, peer: Contact, marks: list[object]) -> None:
-        """Answer MISSING: store at ``peer`` the own leased records that it lacks, and tell it which to drop."""
+        """Answer MISSING: store at ``peer`` the own leased records that it lacks, and name the records to drop."""
         there = [
             r
             for r in self._list_leased()
@@ -451,7 +451,7 @@ class Owner:
         self._transferring.add(contact.node_id)
         try:
             for page in split_pages(records):
-                with suppress(Refused):  # the store is full for one record; the next page may have smaller records
+                with suppress(Refused):  # there is no space for one record; the records of the next page may be smaller
                     await self._overlay.ask(contact, "store", [r.pack() for r in page], changes=True)
         finally:
             self._transferring.discard(contact.node_id)

@@ -23,8 +23,8 @@ from middleware.entangled.wire.endpoint import Endpoint
 WATCH_TTL_S, MAX_WATCH_TTL_S = 8.0, 60.0
 MAX_WATCHERS = 1000
 MAX_IMMEDIATE, BATCH_DELAY_S = 64, 0.1
-"""The number of watchers of a key up to which each change is pushed immediately.  With more watchers, the changes of
-this many seconds share a push."""
+"""The number of watchers of a key up to which each change is pushed immediately.  With more watchers, the changes
+within the second number of seconds share a push."""
 PUSH_BYTES, MAX_REMOVED = 12_000, 100
 """The approximate maximum of bytes, and the maximum number of removed slots, in one push of several changes."""
 MAX_KEYS = 10_000

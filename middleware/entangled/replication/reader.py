@@ -1,4 +1,4 @@
-"""Reads of a key from its replicas: fast from one replica, or consistent from a majority.
+"""Reads of a key from its replicas: a fast read from one replica, or a consistent read from a majority.
 
 If too few replicas are reachable, a read fails with ``Unavailable`` instead of returning an empty result.  If a reply
 takes longer than nearly all replies in this team, the reader sends further requests to other replicas (hedging).
@@ -25,7 +25,8 @@ from middleware.entangled.replication.watch import digest_of
 
 ReadConsistency = Literal["fast", "majority"]
 CATCH_UP_TIMEOUT_S, CATCH_UP_INTERVAL_S = 1.5, 0.1
-"""Seconds for which a read waits until its own node has caught up, and seconds between two checks during this time."""
+"""A read waits up to the first number of seconds until its own node has caught up, and checks this at the second
+interval."""
 MAX_PAGES = 2000
 
 
@@ -160,7 +161,7 @@ class Reader:
         voters: Voters,
         answers: dict[bytes, ReplicaReply],
     ) -> None:
-        """Store records of a minority at a majority before they are returned, so that later reads also return them."""
+        """Store records that only a minority has at a majority, so that later reads also return them."""
         has: dict[Slot, set[bytes]] = {slot: set() for slot in newest}
         for node_id, answer in answers.items():
             for record in answer.records:
@@ -195,7 +196,7 @@ class Reader:
     ) -> dict[bytes, ReplicaReply]:
         """Collect the answers of ``targets``: ask ``width`` in parallel, and two more for each that is slow or fails.
 
-        Two more are asked because failures are correlated: if half of the team has failed, every second replica is
+        Two more are asked because many nodes may fail together: if half of the team has failed, every second replica is
         silent.
         """
         answers: dict[bytes, ReplicaReply] = {}
@@ -253,8 +254,8 @@ class Reader:
         """Find the key in a large network: ask ever nearer nodes until one has records of it (Kademlia, section 2.3).
 
         The records of a node that is not among the closest, or is not synced, may be incomplete; they are used only if
-        no other node has records of the key.  The nearest node that lacks the key gets a cached copy; its lifetime is
-        halved for each node that is nearer to the key.
+        no other node has records of the key.  The nearest node that lacks the key gets a cached copy; the lifetime of
+        the copy is halved for each node that is nearer to the key.
         """
         lookup = Lookup(key, K, ALPHA, self._overlay.find_nearest(key), exclude=self._overlay.own_id)
         found: list[Record] = []

@@ -37,7 +37,7 @@ SWEEP_INTERVAL_S, MAX_SWEEP_INTERVAL_S = 0.1, 60.0
 MAX_LEASE_S = 3600.0
 MAX_MARKS = 100
 MAX_MISMATCHED = 4096
-"""The number of remembered peers whose last ALIVE did not match the stored records."""
+"""The number of peers that are remembered because their last ALIVE did not match the stored records."""
 
 UNSYNCED_REPLY, SYNCED_REPLY, CACHED_REPLY = 0, 1, 2
 """The kinds of a reply: from a replica that is not synced, from a synced replica, or a cached copy."""
@@ -47,8 +47,8 @@ class Replica:
     """The records that one node stores for other owners; its ``watched_copies`` are not visible to peers.
 
     ``may_store`` returns whether the current certificate of a slot's owner allows it to write there.  ``may_stay``
-    returns whether an existing record in the slot may still be stored and returned; the two differ for few slots.
-    ``is_synced`` returns whether this node is synced.
+    returns whether an existing record in the slot may still be stored and returned.  The results of the two functions
+    differ for few slots.  ``is_synced`` returns whether this node is synced.
 
     ``on_record`` is called with each accepted record, and ``on_gone`` with each removed record.  ``on_owner_expired``
     is called with the public key of each owner whose lease expired or that sent GOODBYE.
@@ -181,11 +181,11 @@ class Replica:
         wants_synced: bool = False,
         digest: bytes = b"",
     ) -> list[object]:
-        """Answer FIND_VALUE: return a page of the records under ``key``, the next page's cursor or None, and its kind.
+        """Answer FIND_VALUE: return a page of records of ``key``, the next page's cursor or None, and the reply's kind.
 
-        If this node has no records of the key, it also returns the contacts closest to the key, and unless
-        ``wants_synced`` it may return a cached copy.  If it is not among the nodes closest to the key, its records may
-        be incomplete, so it also returns these contacts to a lookup.  If ``digest`` equals the digest of all stored
+        If this node has no records of the key, it also returns the contacts closest to the key; unless
+        ``wants_synced``, it may return a cached copy.  If this node is not among the nodes closest to the key, its
+        records may be incomplete, so a lookup also gets these contacts.  If ``digest`` equals the digest of all stored
         records, None is returned instead of the records.
         """
         if digest and digest == digest_of(self.get_held(_check_key(key))):
@@ -222,8 +222,9 @@ class Replica:
     def answer_alive(self, peer: Contact, lease: float, digest: bytes) -> None:
         """Answer ALIVE: extend the leases of ``peer``.
 
-        If ``digest`` does not match the stored records of the peer twice, this node sends MISSING.  If it stores no
-        records of the peer, they have expired although the peer is alive, and MISSING is sent immediately.
+        If ``digest`` does not match the stored records of the peer in two successive requests, this node sends MISSING.
+        If this node stores no records of the peer, they have expired although the peer is alive, and MISSING is sent
+        immediately.
         """
         self._overlay.process_message(peer)
         held = self._list_leased(peer.public)
@@ -235,7 +236,7 @@ class Replica:
             self._endpoint.notify(peer, "missing", [digest_of([r]) for r in held[:MAX_MARKS]])
         else:
             if len(self._mismatched) >= MAX_MISMATCHED:
-                self._mismatched.clear()  # the forgotten peers get MISSING one renewal later
+                self._mismatched.clear()  # a peer that is forgotten here gets MISSING one renewal later
             self._mismatched.add(peer.node_id)
 
     def answer_let_go(self, peer: Contact, marks: list[object]) -> None:
@@ -291,7 +292,7 @@ class Replica:
         return acknowledged
 
     def _store_all(self, peer: Contact, records: list[Record], lives: Sequence[float | None]) -> list[int]:
-        """Store the valid records of ``records``; an owner with a full share does not affect other owners."""
+        """Store the valid ones of ``records``; a full share of one owner does not affect other owners."""
         replies = []
         for record, life in zip(records, lives, strict=True):
             try:

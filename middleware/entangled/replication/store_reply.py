@@ -8,7 +8,7 @@ from typing import NamedTuple
 from middleware.entangled.record import Record
 
 MAX_SEQUENCE = 2**62
-"""The highest sequence number in a valid reply; after a higher number an owner would run out of sequence numbers."""
+"""The highest sequence number in a valid reply; with a higher number, an owner would soon have no numbers left."""
 
 
 class Outcome(Enum):

@@ -21,7 +21,7 @@ from middleware.entangled.replication.watch import OnChanged, Watch
 from middleware.entangled.wire.endpoint import Endpoint
 
 RENEW_INTERVAL_S = 2.0
-"""Seconds between two renewals of a watch: four within ``WATCH_TTL_S``."""
+"""Seconds between two renewals of a watch: there are four renewals within ``WATCH_TTL_S``."""
 LARGE_RENEW_INTERVAL_S, LARGE_TTL_S = 20.0, 60.0
 """Seconds between two renewals of a watch, and its duration in seconds, in a large network.  They are longer there,
 because a lookup is needed to find the replicas."""
@@ -206,7 +206,7 @@ class Subscriber:
             watch.push_numbers[peer.node_id] = max(last, number)
             for record in records:
                 watch.view.add(peer.node_id, record)
-            if number > last:  # a push that arrives late may remove a record that exists again
+            if number > last:  # a late push may remove a record that was written again in the meantime
                 for slot in slots:
                     watch.view.remove(peer.node_id, slot)
             self._update(watch)

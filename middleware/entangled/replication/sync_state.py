@@ -27,7 +27,7 @@ class SyncState:
         self.is_synced = False
 
     def start(self, forgot: bool) -> None:
-        """Load the state of the earlier run; ``forgot``: its records were dropped, but other nodes rely on them."""
+        """Load the state from before the restart; ``forgot``: records were dropped, but other nodes rely on them."""
         noted = self._store.get_note(NOTE_NAME)
         is_bare = forgot or self._store.origin == "replaced" or self._store.corrupt_rows > 0
         self._has_lost = noted == LOST or (noted == SETTLED and is_bare)
@@ -52,11 +52,12 @@ class SyncState:
     def is_enough(self, reached: list[int | None], away: int) -> bool:
         """Return whether the nodes in ``reached`` together have every record that a majority has.
 
-        ``reached`` contains the sync states of the nodes that were asked (None: no answer); ``away`` further nodes are
-        absent.  A node that was never synced has no records to send and is not counted in majorities.  If a synced node
-        answered, only synced nodes are counted, because the records of a stale node may be from a time with different
-        members.  A node that lost its records may have been one of the voters.  A new node is admitted by a majority of
-        the earlier nodes; otherwise each half of a partition could grow to a majority.
+        ``reached`` contains the sync states of the nodes that were asked (None: no answer); ``away`` is the number of
+        further nodes, which are absent.  A node that was never synced has no records to send and is not counted in
+        majorities.  If a synced node answered, only synced nodes are counted, because the records of a stale node may
+        be from a time with different members.  A node that lost its records may have been one of the voters.  A new
+        node is admitted by a majority of the earlier nodes; otherwise each half of a partition could grow to a
+        majority.
         """
         missing = reached.count(None) + away
         answered = reached.count(CURRENT) or reached.count(STALE)

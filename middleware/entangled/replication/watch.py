@@ -1,9 +1,9 @@
 """The view of one watched key, merged from its replicas.
 
 ``View`` merges the reports of several replicas, without I/O.  A slot is present as long as any valid report contains
-it.  If reports contain different records of one slot, the record that supersedes the others is used.  A node's own
-leased records in its own report are ignored by all other nodes, because these records would remain after a failure of
-the node.
+it.  If reports contain different records of one slot, the record that supersedes the others is used.  A report of a
+node may contain leased records that this node itself owns.  All other nodes ignore these, because they would remain
+after a failure of the node.
 """
 
 from __future__ import annotations

@@ -26,7 +26,8 @@ from middleware.entangled.space.tuple_record import (
 )
 
 GRACE_S = 2.0
-"""Seconds within which a taker should note its take; afterwards another node that detected the take writes the note."""
+"""Seconds within which a taker should write a note of its take; afterwards, a different node that detected the take
+does."""
 CLEANUP_INTERVAL_S = 30.0
 EARLY_CLEANUP_S = 2.0
 """Seconds before slots are freed if their number grows quickly."""

@@ -35,7 +35,8 @@ from middleware.entangled.space.tuple_record import (
 MAX_TUPLES = 12
 """The maximum number of tuples in one request: more would not fit into a datagram."""
 UNFINISHED_S = 3.0
-"""Seconds after which a member completes a confirmation whose end it has not observed."""
+"""If a member has not observed the end of a confirmation after this number of seconds, it completes the
+confirmation."""
 TERMS = AcceptorSettings(completion_s=1.0, must_prepare=True)
 _INCARNATION: Final = "decree/incarnation"
 
@@ -126,7 +127,7 @@ class TakeAcceptor:
         taker: bytes,
         lease: float,
     ) -> Answers:
-        """Answer CLAIM: grant the ballot a promise and lease on each tuple in ``tuple_ids``, or return the reason."""
+        """Answer CLAIM: grant a promise and a lease on each tuple in ``tuple_ids``, or return the reason."""
         wanted, ballot = self._parse_request(key, tuple_ids, incarnation, counter, taker)
         if not 0.0 < lease <= MAX_LEASE_S:
             raise Refused(f"the lease must be more than 0 and at most {MAX_LEASE_S:.0f} seconds")
@@ -145,7 +146,7 @@ class TakeAcceptor:
         taker: bytes,
         value: bytes,
     ) -> Answers:
-        """Answer CONFIRM: accept ``value`` as the taker of each tuple in ``tuple_ids``, or return the reason."""
+        """Answer CONFIRM: accept ``value`` as the taker of each tuple in ``tuple_ids``, or say why not."""
         wanted, ballot = self._parse_request(key, tuple_ids, incarnation, counter, taker)
         if not is_taker_name(value):
             raise Refused("decree.confirm: the value must be the name of a taker")

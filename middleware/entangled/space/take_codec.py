@@ -102,7 +102,7 @@ def _pack_accepted(ballot: Ballot, value: object) -> list[object] | None:
 
 
 def _unpack_accepted(fields: object) -> tuple[Ballot, bytes | None] | None:
-    """Decode the accepted ballot (``NO_BALLOT`` if there is none) and value; None if the fields are invalid."""
+    """Decode the accepted value and its ballot (``NO_BALLOT`` if no value was accepted); None if a field is invalid."""
     if fields is None:
         return NO_BALLOT, None
     if not isinstance(fields, list) or len(fields) != 3:

@@ -40,7 +40,7 @@ class TakeProposer:
         self._background = background
 
     async def claim(self, tuples: Sequence[StoredTuple], ballot: Ballot, lease: float) -> list[Outcome]:
-        """Run one round of claims for tuples of one key and council; then release the tuples not won."""
+        """Run one round of claims for tuples of one key and council; then release the tuples that were not won."""
         outcomes = await self.renew(tuples, ballot, lease)
         lost = [p for p, o in zip(tuples, outcomes, strict=True) if o.result not in (Result.WON, Result.DECIDED)]
         if lost:

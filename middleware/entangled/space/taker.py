@@ -188,7 +188,7 @@ class Taker:
     ) -> tuple[list[StoredTuple], float | None]:
         """Return the tuples to try now, in this node's order, and the seconds until another tuple may be tried.
 
-        The order differs between nodes, so that takers rarely compete for a tuple.  Tuples that this node failed to
+        Each node has a different order, so that takers rarely compete for a tuple.  Tuples that this node failed to
         claim come last, the oldest failure first, so that tuples with an unreachable council do not block the others.
         """
         now = self._clock.seconds()
@@ -209,7 +209,7 @@ class Taker:
     # -- taking -----------------------------------------------------------------------------------------------------
 
     async def claim(self, tuples: Sequence[StoredTuple], lease: float) -> tuple[list[Claim], bool]:
-        """Claim tuples of one council; return the claims won, and whether too few members answered."""
+        """Claim tuples of one council; return the claims that were won, and whether too few members answered."""
         places = [one.tuple_id for one in tuples]
         self.claimed.update(places)
         ballot = Ballot(1 + max(self._counters.get(tuple_id, 0) for tuple_id in places), self._make_proposer_name())
@@ -260,7 +260,7 @@ class Taker:
         if winner != taker:
             self._slots.check_taken_note(tuple_id, winner)
             return False
-        with suppress(EntangledError):  # the node republishes the note later, and the council knows the taker
+        with suppress(EntangledError):  # harmless: the node republishes the note later, and the council knows the taker
             await self._slots.put_taken_note(tuple_id, winner)
         if wait is not None and wait.is_over:
             self._on_unwanted(claim.fields)

@@ -52,7 +52,7 @@ class Predicate:
     def holds(self, value: Value) -> bool:
         """Return whether ``value`` satisfies the predicate.
 
-        A value of a type different from the operand's satisfies only ``!=``.
+        If the type of ``value`` differs from the type of the operand, only ``!=`` is satisfied.
         """
         operand = self.operand
         if isinstance(operand, tuple):

@@ -77,7 +77,7 @@ class TupleCache:
             self._watch = None
 
     async def sleep(self, seconds: float | None) -> None:
-        """Return at the next change, at ``wake``, or after ``seconds``."""
+        """Return when the tuples change, when ``wake`` is called, or after ``seconds``."""
         woken: Deferred[None] = Deferred()
         self._sleepers[woken] = None
         rest = self._background.later(seconds, self._wake_one, woken) if seconds is not None else lambda: None

@@ -2,7 +2,7 @@
 
 A tuple is a record of its publisher.  The record lists the members of the council that decides about the taker of the
 tuple; ``take_acceptor`` contains the acceptors, ``taker`` the proposers.  ``docs/reference/tuple-space.md`` describes
-the conditions for which calls wait.
+for what each call waits.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class NoTuple(TransientError):
 class TupleSpace:
     """The tuples of one space, used through one node.
 
-    ``council`` is the number of nodes that decide about each tuple that this node puts.  A council of 3 survives the
+    ``council`` is the number of members of the council of each tuple that this node puts.  A council of 3 survives the
     loss of 1 node, and a council of 5 the loss of 2 nodes, but with more requests.  Spaces with different names are
     separate.
     """

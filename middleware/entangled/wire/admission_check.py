@@ -77,7 +77,7 @@ class Authority(NamedTuple):
     def is_final(self) -> bool:
         """Whether records that this authority does not allow can never become valid later.
 
-        With another refusal they may become valid with time, or by a later certificate.
+        If the refusal is not final, they may become valid with time, or by a later certificate.
         """
         return self.refusal in ("", REVOKED, ROLE)
 
@@ -115,7 +115,7 @@ class AdmissionCheck(Protocol):
         return ""
 
     def admit(self, public: bytes, peer_pass: bytes) -> str:
-        """Do the same as ``find_refusal`` for a node with a confirmed session; this method may record the node."""
+        """Return the same as ``find_refusal``, for a node with a confirmed session; this method may record the node."""
         return ""
 
     def may_call(self, public: bytes, method: str) -> bool:
@@ -196,7 +196,10 @@ class Incarnations:
         return len(self._known)
 
     def find_refusal(self, public: bytes, incarnation: Incarnation) -> str:
-        """Return the refusal code of this incarnation, empty if no later one is known; change no state."""
+        """Return the code with which this incarnation is refused, or an empty string if no later incarnation is known.
+
+        This method changes no state.
+        """
         last, before = self._known.get(public, (incarnation, incarnation))
         if incarnation == last or incarnation.number > last.number or not incarnation.number:
             return ""
@@ -259,7 +262,7 @@ class LogLimiter:
 
 
 def check_secrets(secrets: Sequence[bytes]) -> tuple[bytes, ...]:
-    """Return the secrets of a team, newest first; raise ``ValueError`` unless each has 32 bytes and there is one."""
+    """Return a team's secrets, newest first; raise ``ValueError`` if there is none or one does not have 32 bytes."""
     if not secrets or any(len(secret) != 32 for secret in secrets):
         raise ValueError("the team secrets are invalid: at least one is needed, and each must have 32 bytes")
     return tuple(dict.fromkeys(secrets))

@@ -18,7 +18,8 @@ BASE_ROUND_TRIP_S = 10.0
 MIN_LOSS_SAMPLES = 32
 ROUND_SAMPLES = 8
 FIRST_GAIN, GAIN = 1 / 16, 1 / 128
-"""The weights of the first datagram (as if 15 had arrived before it) and of each datagram after the first hundred."""
+"""The weight of the first datagram (as if 15 datagrams had arrived before), and of each datagram after the first
+hundred."""
 MAX_GAP_LOSSES = 4
 """The maximum number of losses that are counted for one gap in the datagram numbers.
 
@@ -155,7 +156,7 @@ class CongestionWindow:
         self._lost += count
 
     def collapse(self) -> None:
-        """Restart from the smallest window, after no receipt arrived for more than a round trip."""
+        """Restart from the smallest window, because no receipt arrived for more than a round trip."""
         self._threshold = max(MIN_WINDOW, self.size / 2)
         self.size = MIN_WINDOW
 
@@ -192,8 +193,8 @@ class LossRate:
     def record_arrival(self, ahead: int) -> None:
         """Update the rate with a received datagram.
 
-        ``ahead`` is the difference between its counter and the highest earlier counter in its session. If ``ahead`` is
-        0 or less, the datagram was reordered and has already been counted as lost.
+        ``ahead`` is the difference between the counter of the datagram and the highest earlier counter in the session.
+        If ``ahead`` is 0 or less, the datagram was reordered and has already been counted as lost.
         """
         for _ in range(1, min(ahead, MAX_GAP_LOSSES + 1)):
             self._add_sample(1.0)
@@ -203,7 +204,7 @@ class LossRate:
             self.rate = max(0.0, self.rate - self._gain)
 
     def _add_sample(self, lost: float) -> None:
-        self._gain = max(GAIN, self._gain / (1 + self._gain))  # a mean at first, later a moving average
+        self._gain = max(GAIN, self._gain / (1 + self._gain))  # at first a plain mean, later a moving average
         self.rate += (lost - self.rate) * self._gain
 
     @property

@@ -129,7 +129,7 @@ class CookieCheck:
 
 
 class Discoverer(ProbeSender[Contact]):
-    """Discovers the node at an address, answers discovery requests, and resends INITs with requested cookies.
+    """Discovers the node at an address, answers discovery requests, and resends INITs with the requested cookies.
 
     Discovery tries each secret in the ring of ``peers`` in turn, the newest first.
     """

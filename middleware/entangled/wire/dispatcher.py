@@ -87,12 +87,12 @@ class Dispatcher:
         self._rate_limits.clear()
 
     def evict(self, public: bytes) -> None:
-        """Forget the requests of a peer and cancel the running ones."""
+        """Forget the requests of a peer, and cancel those that are running."""
         for work in self._history.evict(public):
             work.cancel()
 
     def delete_full_limiters(self, now: float) -> None:
-        """Delete the rate limiters that are full again at the time ``now``."""
+        """Delete the rate limiters of peers that used no tokens lately: those that are full at the time ``now``."""
         for public in [public for public, bucket in self._rate_limits.items() if bucket.is_full(now)]:
             del self._rate_limits[public]
 

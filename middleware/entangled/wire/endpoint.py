@@ -194,8 +194,8 @@ class Endpoint:
         """Replace the secret of the team (32 bytes); existing sessions continue.
 
         This node opens handshakes under the ``newest`` secret.  Handshakes under the ``older`` secrets are also
-        accepted, because some members may not have the newest secret yet.  A peer that does not answer under one secret
-        is retried under the next.  Raises ``ValueError`` for an invalid secret.
+        accepted, because some members may not have the newest secret yet.  If a peer does not answer under one secret,
+        this node retries under the next secret.  Raises ``ValueError`` for an invalid secret.
         """
         secrets = check_secrets([newest, *older])
         self._peers.rekey([Credentials.derive(self._identity, secret) for secret in secrets])
@@ -334,8 +334,8 @@ class Endpoint:
     def forget_silent(self, seconds: float) -> None:
         """Forget the peers that sent nothing for ``seconds``, unless a request to them is pending.
 
-        The peer forgets the session after the same time, or detects with its next unanswered request that it is gone.
-        Either side opens a new session when it needs one.
+        The peer forgets the session after the same time, or detects by an unanswered request that this node has
+        forgotten it.  Either side opens a new session when it needs one.
         """
         now = self._clock.seconds()
         self._half_open.sweep(now)
@@ -345,7 +345,7 @@ class Endpoint:
             self.on_forgotten(public)
 
     def reopen(self, contact: Contact) -> None:
-        """Open a session at the contact's address even if there is one at another address; the newest is used."""
+        """Open a session at the contact's address even if one at another address exists; the newest session is used."""
         if self.is_running:
             self._peers.open(self._peers.get_or_create(contact), contact.address)
 

@@ -22,9 +22,7 @@ from middleware.entangled.wire.message import (
 )
 
 IDLE_TIMEOUT_S = 10.0
-MAX_PARALLEL_MESSAGES = (
-    4  # messages to one peer that are sent in turn; the others wait, to limit the memory used at the receiver
-)
+MAX_PARALLEL_MESSAGES = 4  # messages to one peer that are sent alternately; more wait, to limit the receiver's memory
 RECEIPT_EVERY = 4
 REORDERING_THRESHOLD = (
     3  # after a round trip, a fragment is lost if one sent this many places later has arrived (RFC 9002, 6.1.1)
@@ -76,7 +74,7 @@ class FragmentedMessage:
         return self.acknowledged == (1 << self.count) - 1
 
     def next_fragment(self, limit: int | None = None) -> int | None:
-        """Return the next fragment to send, lost ones first; None if all are sent or the receiver's buffer is full."""
+        """Return the next fragment to send, lost ones first; None if all were sent or the receiver's buffer is full."""
         acknowledged, most = self.acknowledged, self.window_end if limit is None else limit
         while self._lost_fragments and acknowledged >> self._lost_fragments[0] & 1:
             self._lost_fragments.popleft()
@@ -245,7 +243,7 @@ class Flow:
                 break
             self._mark_sent(message, number, now)
             picked.append((message, number))
-        # Each message requests its own receipts: for its last fragment in this burst, and for every fourth fragment.
+        # Each message requests receipts: for its last fragment in this burst, and for every fourth fragment.
         last = {message.key: place for place, (message, _) in enumerate(picked)}
         for place, (message, number) in enumerate(picked):
             self._send_sealed(message.make_fragment(number, message.requests_receipt() or place == last[message.key]))

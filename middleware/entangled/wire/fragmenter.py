@@ -45,7 +45,8 @@ MAX_TRANSFER_S = 60.0
 # never finish.
 SLOW_AFTER_S, MIN_FRAGMENTS_PER_S = 1.0, 8.0
 CLEARING_INTERVAL_S = 0.5
-# A peer that had a message dropped may not use this part of the buffer for TARDY_S seconds, so that others can.
+# After a message of a peer was dropped, the peer may not use this part of the buffer for TARDY_S seconds, so that other
+# peers can use it.
 RESERVED_BYTES = 2 * MAX_MESSAGE_BYTES
 PENALTY_S, MAX_PENALIZED = 60.0, 1024
 # The number of completed incoming messages that are remembered; their repeated fragments are acknowledged and dropped.
@@ -167,7 +168,7 @@ class Fragmenter:
             flow = self._make_flow(public)
         self._flows[public] = self._flows.pop(public)  # the least recently used flow is first
         if key in flow.messages:
-            return True  # it is already under way
+            return True  # the message is already under way
         if key.is_answer and not self.reserve(public, len(message)):
             return False
         flow.send(key, message)
@@ -216,7 +217,7 @@ class Fragmenter:
         if flow is not None and receipt.key in flow.messages:
             now = self._clock.seconds()
             if now - flow.progress_reported_at >= PROGRESS_INTERVAL_S:
-                # Requests that wait for their turn count as progressing also.
+                # Requests that wait for their turn are also considered to make progress.
                 flow.progress_reported_at = now
                 for key in flow.messages:
                     if not key.is_answer:

@@ -55,8 +55,8 @@ MAX_BITMAP_BYTES = -(-MAX_FRAGMENTS // 8)
 class Request:
     """Calls ``method``; the requester's ``id`` (64 bits) distinguishes a repeated request from a new one.
 
-    The requester no longer waits for its requests to this peer with an id below ``id - behind``.  ``left_ms`` is the
-    time that the requester will still wait, in milliseconds.
+    The requester no longer waits for answers to its requests to this peer that have an id below ``id - behind``.
+    ``left_ms`` is the time that the requester will still wait, in milliseconds.
     """
 
     id: int

@@ -31,7 +31,7 @@ MAX_PER_PEER = 4096
 SEQUENCE_BITS = 32
 """The low bits of a request id, which a requester increments; the bits above are random and new after each restart."""
 MAX_INCARNATIONS = 4
-"""The number of restarts of one peer within ``KEEP_ANSWER_S`` for which ``lowest_open`` is kept."""
+"""``lowest_open`` is stored for this number of restarts of one peer within ``KEEP_ANSWER_S``."""
 MAX_ENTRIES = 16384
 MAX_REQUESTERS = 4096
 _PLAIN_TYPES = (int, float, bool, str, bytes, list, dict, type(None))
@@ -56,7 +56,7 @@ class _Signature(NamedTuple):
 
 
 _SIGNATURES: WeakKeyDictionary[Callable[..., object], _Signature] = WeakKeyDictionary()
-"""The parameters of methods of classes: the same for all nodes of a process."""
+"""A cache of the parameters of methods of classes, which are the same for all nodes of a process."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,7 +235,7 @@ class RequestHistory:
         return account is not None and number < account.lowest_open.get(number >> SEQUENCE_BITS, 0)
 
     def forget_before(self, public: bytes, oldest: int, now: float) -> None:
-        """Forget the ended requests of a peer before ``oldest``, because the peer no longer needs their answers."""
+        """Forget a peer's ended requests with ids below ``oldest``, because the peer no longer needs their answers."""
         account = self._get_or_create(public, now)
         if account is None:
             return  # ``begin`` will reject the request
@@ -280,7 +280,7 @@ class RequestHistory:
             account.finished[number] = entry
 
     def evict(self, public: bytes) -> list[Deferred[object]]:
-        """Forget the requests of a peer; return the running work, which the caller cancels."""
+        """Forget the requests of a peer; return the work that is still running, which the caller must cancel."""
         account = self._peers.pop(public, None)
         if account is None:
             return []

@@ -56,7 +56,7 @@ def seal(key: bytes, counter: int, plaintext: bytes, ad: bytes) -> bytes:
     """Encrypt ``plaintext`` with ChaCha20-Poly1305 and Noise's nonce (section 12); the result is 16 bytes longer.
 
     This function calls libsodium directly, because the argument checks of PyNaCl's wrapper take three quarters of the
-    time.  Memory safety requires only the check of the key length.
+    time.  The check of the key length is sufficient for memory safety.
     """
     if len(key) != KEY_BYTES:
         raise ValueError(f"a key must have {KEY_BYTES} bytes, not {len(key)}")

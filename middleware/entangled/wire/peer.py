@@ -41,9 +41,9 @@ PUNCH_INTERVAL_S, FAST_PUNCHES = 0.1, 16
 """The seconds between two INITs during hole punching, and the number of INITs after which the interval grows."""
 LIVE_S = 3.0
 SESSION_SILENCE_S = 105.0
-"""In a wide network, seconds of silence up to which the peer is assumed to have the session still.  This is shorter
-than the time after which a session is forgotten; the margin covers the difference between the last datagrams of both
-sides."""
+"""In a large network, a peer is assumed to still have the session if it was silent for at most this number of seconds.
+This is shorter than the time after which a session is forgotten; the margin covers the difference between the last
+datagrams of both sides."""
 SESSION_LIFE_S = 120.0
 """The age in seconds at which a session is replaced when something is sent in it."""
 RENEWAL_DELAY_S = 30.0
@@ -81,8 +81,8 @@ class OutgoingHandshake:
     The first INIT was sent to ``address``.  ``cookies`` maps every address to which the INIT is sent to the cookie that
     was requested there.  The session is needed within ``timeout_s`` seconds.  Until the time ``held_until`` other nodes
     help with hole punching, and the handshake continues regardless of the number of its tries.  ``has_request``: a
-    request waits for the handshake; otherwise this node started it to admit the peer or to find a better path.  A
-    handshake that ``is_waiting`` sends nothing more and waits for a late RESP.
+    request waits for the handshake; if none does, this node started the handshake to admit the peer or to find a better
+    path.  A handshake that ``is_waiting`` sends nothing more and waits for a late RESP.
     """
 
     initiator: InitiatorHandshake
@@ -276,7 +276,7 @@ class Peers:
     def find_usable_session(self, peer: Peer) -> Session | None:
         """Return the session to send in, or None; drop the peer's sessions that reached their datagram limit.
 
-        The sessions with an idle peer that may have forgotten them are also dropped.
+        If an idle peer may have forgotten its sessions, these are also dropped.
         """
         session = peer.session
         if session is None:
@@ -290,7 +290,7 @@ class Peers:
     def renew_if_old(self, session: Session) -> None:
         """Open a successor of a session that is old or near its datagram limit; call this before sending in it.
 
-        Of the two peers, the peer with the lower key opens the successor first, so that there are not two successors.
+        The one of the two peers that has the lower key opens the successor first, so that there are not two successors.
         """
         public = session.contact.public
         life = SESSION_LIFE_S if self.ring[0].public < public else SESSION_LIFE_S + RENEWAL_DELAY_S
@@ -303,7 +303,7 @@ class Peers:
     def has_live_session(self, peer: Peer) -> bool:
         """Return whether there is a session that a running peer has not forgotten yet.
 
-        In a wide network each node forgets the sessions with a silent peer without notification, at a time that the
+        In a large network, each node forgets the sessions with a silent peer without notification, at a time that the
         peer does not know.  Datagrams that the peer sends later in such a session are lost.
         """
         since = self._clock.seconds() - SESSION_SILENCE_S if self.is_large else float("-inf")
@@ -323,7 +323,7 @@ class Peers:
             self._delete_sessions(peer.sessions[:1])
             peer.sessions = peer.sessions[1:]
         if peer.handshake is not None and peer.handshake.punches and not is_carried:
-            self.close(peer.handshake)  # during hole punching, the peer's handshake succeeded before this node's own
+            self.close(peer.handshake)  # during hole punching, the handshake of the peer succeeded first
         if self._sweeper is None:
             self._sweep()
         self.on_established(session)
@@ -529,7 +529,7 @@ class Peers:
         is_over = left <= 0 if opening.is_waiting else opening.tries >= self.tries
         if is_over and self._clock.seconds() >= opening.held_until:
             self.close(opening)
-            if len(self.ring) > 1:  # the peer may not have the newest secret yet, or no longer have an older one
+            if len(self.ring) > 1:  # the peer may lack the newest secret, or may have deleted an older secret
                 ring = list(self.ring)
                 tried = ring.index(opening.initiator.credentials) if opening.initiator.credentials in ring else -1
                 opening.peer.credentials = ring[(tried + 1) % len(ring)]
@@ -566,7 +566,7 @@ class Peers:
         round_trip = opening.peer.round_trip
         wait = self.retry_interval(round_trip, opening.tries, opening.timeout_s)
         if opening.tries == self.tries and not round_trip.is_measured:
-            # This peer has not been measured: it may be distant, not unreachable.
+            # The round trip of this peer has not been measured, so the peer may be distant instead of unreachable.
             wait = max(wait, opening.started_at + HANDSHAKE_S - self._clock.seconds())
         return wait
 

@@ -97,7 +97,7 @@ class ProbeResponder:
 
 @dataclass(slots=True, eq=False)
 class PendingProbe(Generic[T]):
-    """A request outside of a session, to an address; the tries send each of ``datagrams`` in turn."""
+    """A request to an address outside of any session; successive tries send the ``datagrams`` one after the other."""
 
     address: Address
     datagrams: Sequence[bytes]

@@ -21,7 +21,7 @@ class Rejection:
 
     ``who`` is the public key of the other node, empty if it sent none.  ``side`` is the direction: ``they`` (the other
     node rejects this node), ``we`` (this node rejects the other node), ``call`` (this node rejects a call of the other
-    node), or ``code`` (the join code of a newcomer is invalid).  ``reason`` is for operators: the cause, and after a
+    node), or ``code`` (a newcomer has used an invalid join code).  ``reason`` is for operators: the cause, and after a
     semicolon the remedy.
     """
 

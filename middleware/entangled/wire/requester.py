@@ -54,9 +54,9 @@ class PendingRequest:
     """A request that waits for its answer.
 
     ``has_long_timeout``: the caller gave a longer timeout than the default.  ``is_fragmented``: the request is sent in
-    fragments.  ``avoids_handshake``: the request does not justify a handshake.  ``extension_s`` is the time in seconds
-    within which the answer must arrive after the request left the queue and after each acknowledged fragment; 0 if the
-    caller gave a timeout.
+    fragments.  ``avoids_handshake``: no handshake may be started for the request alone.  ``extension_s`` is the time in
+    seconds within which the answer must arrive after the request left the queue and after each acknowledged fragment; 0
+    if the caller gave a timeout.
     """
 
     number: int
@@ -154,7 +154,7 @@ class Requester:
         )
         is_open = (
             self._peers.find_usable_session(peer) is not None
-        )  # evaluated before the request itself marks the session as in use
+        )  # this must be evaluated before the request marks the session as in use
         self._requests[number] = request
         peer.add_request(number)
         if is_open and (peer.in_flight < MAX_IN_FLIGHT or not request.is_counted):
@@ -336,9 +336,9 @@ class Requester:
         peer.notifications = ()
         if peer.sessions:
             for request in self._requests_to(peer):
-                if request.tries >= self._peers.tries:  # the request waited only for this handshake
+                if request.tries >= self._peers.tries:  # this request waited only for the handshake
                     self._on_timer(request)
-            return  # the other requests have their own timers
+            return  # the remaining requests have their own timers
         for request in self._requests_to(peer):
             was_tried = request.created_at <= opening.started_at and request.address == opening.address
             if request.has_long_timeout or not was_tried:

@@ -2,8 +2,8 @@
 
 INIT and RESP each contain a message, the sender's incarnation, and the sender's admission credential, which the other
 side checks.  INIT is padded so that RESP is never larger; RESP contains the source address of the INIT, or a refusal.
-With a keyed hash near the end of INIT, a node can drop forged datagrams in a microsecond, without four key exchanges.
-Under load a second hash is required, made with a cookie from the responder (``discovery``).
+A keyed hash near the end of INIT lets a node detect and drop a forged datagram in a microsecond, without four key
+exchanges.  Under load a second hash is required, made with a cookie from the responder (``discovery``).
 
 A DATA datagram consists of the type (1 byte), the receiver's index of the session (4), the counter (8), and the
 encrypted message with its tag (16): 29 bytes more than the message.  The 13 header bytes are also authenticated.
@@ -239,12 +239,12 @@ class ResponderHandshake:
 
 
 def is_init_of_team(own: Credentials, datagram: bytes) -> bool:
-    """Return whether the sender of an INIT of valid size has the team secret of ``own``."""
+    """Return whether the sender of an INIT (of a valid size) has the team secret of ``own``."""
     return hmac.compare_digest(_keyed_hash(own.mac_key, datagram[: -2 * MAC_BYTES]), read_mac(datagram))
 
 
 def read_mac(init: bytes) -> bytes:
-    """Return the hash in an INIT that is keyed with the team's key."""
+    """Return the hash in an INIT that was computed with the team's key."""
     return init[-2 * MAC_BYTES : -MAC_BYTES]
 
 
@@ -366,7 +366,8 @@ class Session:
         message = open_sealed(self._receiving, counter, datagram[_HEADER_BYTES:], header)
         ahead = counter - self._highest
         if ahead > 0:
-            # A counter may advance by up to 2**64; a shift by more than the window would only waste memory.
+            # A counter may advance by up to 2**64, but a bitmap that is shifted by more than the window only wastes
+            # memory.
             self._seen = ((self._seen << ahead) & _WINDOW_MASK if ahead < WINDOW else 0) | 1
             self._highest = counter
         else:
