@@ -43,7 +43,8 @@ def assign_posts(angles: Sequence[tuple[str, float]], assigned: str | None) -> d
     step = math.tau / max(1, len(order))
     fixed = next((n for n, (uuid, _) in enumerate(order) if uuid == assigned), None)
     if fixed is None:
-        # Each robot's preferred rotation of the posts; with the circular mean the robots move least in total.
+        # The rotations that would put each robot's post at its present direction; with their circular mean the robots
+        # move least in total.
         preferred_turns = [angle - n * step for n, (_, angle) in enumerate(order)]
         turn = math.atan2(sum(map(math.sin, preferred_turns)), sum(map(math.cos, preferred_turns)))
     else:

@@ -158,7 +158,7 @@ class Agent(Service):
             each.engagement.set_robot_lent(each in parts and each is not part, self._clock.seconds())
 
     def _group_by_urgency(self, active: list[Participation]) -> dict[Participation, list[Participation]]:
-        """Return the most urgent part of each group, with all parts of the group.
+        """Return the most urgent participation of each group, together with all participations in the group.
 
         A task without a group forms a group of its own.
         """

@@ -1,9 +1,9 @@
 """Assign the open tasks of a group jointly to the agents that can do them; pure.
 
-Each agent computes the assignment of the whole group from the reports on all its tasks, and then uses the part of each
-task. The digest of a decision therefore covers the reports on all these tasks. An acting agent is considered only for
-its own task, at a cost reduced by the task's hysteresis, so a task of a group is reassigned under the same condition
-as a task without a group.
+Each agent computes the assignment of the whole group from the reports on all its tasks, and takes the decision for each
+task from it. The digest of a decision therefore covers the reports on all these tasks. An acting agent is considered
+only for its own task, at a cost reduced by the task's hysteresis, so a task of a group is reassigned under the same
+condition as a task without a group.
 """
 
 from __future__ import annotations

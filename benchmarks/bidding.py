@@ -86,7 +86,7 @@ class LinkFaults:
 
 @dataclass
 class Outcome:
-    """The result of an auction; ``took``: seconds from the waiting period to the right decision, for each agent."""
+    """The result of an auction; ``took`` has each agent's seconds from the waiting period to the right decision."""
 
     messages: float
     busiest: int

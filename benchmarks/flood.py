@@ -86,8 +86,8 @@ def make_generators(order: dict[str, Any]) -> dict[str, Callable[[], bytes]]:
 
     single: dict[str, Callable[[], bytes]] = {
         "random": lambda: some(rng.randrange(1, 1400)),
-        # Length and padding of a real INIT, with zeros instead of the mac, which needs the team's secret, and no
-        # payment.
+        # The length and padding are those of a real INIT. The mac, which needs the team's secret, is zeros, and there
+        # is no payment.
         "init": lambda: bytes([session.INIT]) + some(1283) + bytes(16),
         "data": data,
         "replay": lambda: rng.choice(recorded),

@@ -44,7 +44,7 @@ class OperationBenchmark:
             self.team.clock.advance(STEP_S)
 
     def measure_each(self, work: Callable[[int], Deferred[Any]], times: int, wide: int = 1) -> str:
-        """Return the cost of one of ``times`` operations, ``wide`` of them in parallel, in the best quarter."""
+        """Run ``times`` operations, ``wide`` of them in parallel; return the cost of one in the best quarter."""
         self.failed = 0
         gc.collect()
         sent, moment = self.team.total_traffic.sent, self.team.clock.seconds()

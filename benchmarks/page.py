@@ -242,7 +242,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--rate", type=float, default=100.0, help="requests a second")
     args = parser.parse_args(arguments)
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
-    # Both ends of each connection are files; the child processes inherit this limit.
+    # Both ends of each connection count as open files; the child processes inherit this limit.
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(4096, most), most))
     udp, where = (
         free_ports.find_free_ports("udp", "127.0.0.1", 1)[0],

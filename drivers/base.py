@@ -175,7 +175,7 @@ class BaseDriver:
         return fail(Unsupported(f"{self._name} has no skill {name!r}; its skills are {known}"))
 
     def diagnostics(self) -> dict[str, float]:
-        """Return counters: frames, bad frames, pictures, bytes, links, reconnects, refused; and ``age``.
+        """Return counters (frames, bad frames, pictures, bytes, links, reconnects, refused) and ``age``.
 
         ``age`` is the age of the newest observation in seconds. ``accepted`` counts the commands that this driver
         accepted, ``lower token`` and ``late`` those that it refused. With a dead man's switch, ``halts`` is the number

@@ -86,7 +86,7 @@ def load_factory(kind: str, place: str) -> Factory:
 
 
 def get_description(make: Factory, options: Mapping[str, object], name: str) -> Description:
-    """Return the description of such a robot, by creating a temporary driver, which opens no links."""
+    """Return the description of a robot from a temporary driver, which ``make`` creates and which opens no links."""
     return make(options, name, Clock(), None).description
 
 

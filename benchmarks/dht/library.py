@@ -82,7 +82,7 @@ class Library:
 
     @property
     def is_installed(self) -> bool:
-        """Return whether its library can be imported."""
+        """Return whether the library can be imported."""
         return importlib.util.find_spec(self.package) is not None
 
     def make_node(self, folder: str) -> LibraryNode:

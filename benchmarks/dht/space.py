@@ -83,7 +83,7 @@ async def _measure_wakeups(workload: Workload) -> Result:
 
 
 async def _measure_races(workload: Workload) -> Result:
-    """Let several nodes take one tuple at once; count the races with exactly one winner."""
+    """Let several nodes take one tuple at the same time; count the races with exactly one winner."""
     single = 0
     count = workload.plan.scale_count(RACES)
     for number in range(count):

@@ -139,7 +139,7 @@ class Workload:
     # -- phases -----------------------------------------------------------------------------------------------------
 
     async def run_healthy(self) -> bool:
-        """Join, rest, single operations, concurrent operations, memory; return False if the join failed."""
+        """Measure joins, the idle network, single and concurrent operations, memory; return False if a join failed."""
         joiners = min(JOINERS, len(self.nodes) - 2)
         async with self.phase("join", 3 * PHASE_LIMIT_S):
             await self.start_nodes(self.nodes[: len(self.nodes) - joiners])

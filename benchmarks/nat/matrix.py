@@ -135,7 +135,7 @@ class Trial:
         return outcome
 
     async def record_path(self) -> None:
-        """Record the present path between them."""
+        """Record the present path between the two nodes."""
         try:
             self.outcome.later = await self._find_worse_path(
                 [await self._read_path(host, self._peer_of(host)) for host in self.join_order]

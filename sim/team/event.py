@@ -45,7 +45,7 @@ class Answered(Event):
 class Unanswered(Event):
     """The client gave up: the operation may have been executed, or may still be executed.
 
-    ``is_unavailable``: the client got the error that too few replicas are available.
+    ``is_unavailable`` is whether the client got the error that too few replicas are available.
     """
 
     number: int
@@ -69,7 +69,7 @@ class Born(Event):
 
 @dataclass(frozen=True, slots=True)
 class Died(Event):
-    """A life ended: the node stopped; ``forgets``: the next node may lack stored data."""
+    """A life ended because the node stopped; with ``forgets``, the next node may lack stored data."""
 
     place: int
     forgets: bool = False

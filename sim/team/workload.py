@@ -38,7 +38,7 @@ class Workload:
 class WorkloadKind:
     """A kind of workload: ``settings`` is a frozen dataclass with constrained fields (``formats.convert``).
 
-    ``make(team, settings)`` creates one.
+    ``make(team, settings)`` creates a workload of this kind.
     """
 
     settings: type[Any]

@@ -82,7 +82,7 @@ class VerifiedTeam:
 def make_parser(
     prog: str, purpose: str, needs_key: bool = True, is_asked: bool = True, example: str = ""
 ) -> argparse.ArgumentParser:
-    """Return the parser of a verb with the common options; ``is_asked``: the verb sends requests to a node."""
+    """Return the parser of a verb with the common options; with ``is_asked`` the verb sends requests to a node."""
     epilog = f"Example: swarm {prog} {example}".rstrip()
     verb_parser = argparse.ArgumentParser(prog=f"swarm {prog}", description=purpose, epilog=epilog)
     if is_asked:
