@@ -250,7 +250,7 @@ class Decider:
         return decision
 
     def is_first(self, now: float) -> bool:
-        """Return whether this agent does the group's duties: no agent executes the task, and its uuid is the lowest."""
+        """Return whether this agent does the group's duties: no agent executes the task and its uuid is the lowest."""
         others = self.others(now)
         return (
             self.is_report_visible(now)

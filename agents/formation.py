@@ -1,9 +1,10 @@
 """Assign posts to the robots that do not act, for the best joint view (thesis, section 4.2.5); pure.
 
-All robots have the target and compass north in common: from its compass and the bearing of the target each robot
-computes its own direction as seen from the target. The posts are evenly spaced around the target, in the robots'
-current order, so that no paths cross; the assigned robot does not move. Until the target is seen, each robot searches
-its own sector. The formation changes only after a member has left, to close the gap.
+A post is the place of one robot around the target. All robots have the target and compass north in common: from its
+compass and the bearing of the target each robot computes its own direction as seen from the target. The posts are
+evenly spaced around the target, in the robots' current order, so that no paths cross; the assigned robot does not move.
+Until the target is seen, each robot searches its own sector. The formation changes only after a member has left, to
+close the gap.
 """
 
 from __future__ import annotations

@@ -185,8 +185,8 @@ class TcpConnector:
     """Opens links over TCP on ``reactor`` (None: the running one).
 
     ``waits`` are the delays in seconds before each retry, of which the last one is repeated; without ``waits`` the
-    delays grow exponentially. With ``says`` the reason why a link cannot be opened is logged, once until the link
-    opens.
+    delays grow exponentially. With ``says`` the reason why a link cannot be opened is logged, and not repeated until a
+    link has opened.
     """
 
     def __init__(self, reactor: Any = None, waits: Sequence[float] = (), says: bool = False) -> None:

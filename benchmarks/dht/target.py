@@ -90,7 +90,7 @@ def get_own_result(row: Row) -> Result:
 
 
 def make_own_reader(read: Reader) -> RowReader:
-    """Return a reader of ``read`` in the results of this library."""
+    """Return a function that applies ``read`` to the results of this library."""
     return lambda row: read(get_own_result(row))
 
 

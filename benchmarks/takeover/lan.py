@@ -2,7 +2,7 @@
 
 Needs Linux with ``unshare`` and ``ip``, without privileges: ``python -m benchmarks.takeover --real`` runs itself in a
 user and network namespace, in which this process is the router. The robots are attached to the router itself, so a node
-whose radio is lost keeps its robot.
+that loses its radio connection keeps its robot.
 """
 
 from __future__ import annotations

@@ -292,7 +292,7 @@ class VoteAccepted(Event):
 
 @dataclass(frozen=True, slots=True)
 class LivingMembers(Event):
-    """The living council members, with their incarnations: a new incarnation has forgotten its votes."""
+    """The living council members, with their incarnations; a new incarnation has lost the votes of the member."""
 
     members: tuple[tuple[bytes, bytes], ...]
 

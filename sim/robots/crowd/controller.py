@@ -66,7 +66,8 @@ class Readings:
         distance = bearing.copy()
         if target is not None:
             dx, dy = target.x - crowd.x, target.y - crowd.y
-            # A robot that hides the target from a robot in this set is nearer to the target, so it is also in this set.
+            # A robot that hides the target from a robot in this set is nearer to the target, so the hiding robot is
+            # also in this set.
             near = np.flatnonzero(dx * dx + dy * dy < SIGHT_M * SIGHT_M)
             dx, dy = dx[near], dy[near]
             far, towards = np.hypot(dx, dy), np.arctan2(dy, dx)
