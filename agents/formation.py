@@ -105,8 +105,8 @@ MIN_CIRCLING_RADIUS_M = 0.45
 class PostPath:
     """The path of one robot to its post around the target at constant distance, in short chords.
 
-    Camera and ranger of a robot look only ahead, so the robot turns along the circle, walks a chord while the path is
-    free, and turns back to the target before the next chord. A robot without a ranger does not move.
+    Camera and ranger of a robot look only ahead, so the robot turns along the circle and walks a chord while the path
+    is free. Before the next chord it turns back to the target. A robot without a ranger does not move.
     """
 
     def __init__(self, motion: MotionCapabilities | None = None) -> None:

@@ -79,7 +79,7 @@ class CouncilMaintainer:
 
 
 def _ignore_unreachable(failure: Any) -> None:
-    """Ignore that too few members answered or that the lease is claimed: the council maintainer tries again."""
+    """Ignore that too few members answered, or that the lease is claimed; the council maintainer tries again."""
     failure.trap(EntangledError)
 
 

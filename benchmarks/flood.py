@@ -1,10 +1,10 @@
 """Send forged datagrams to a node: ``python -m benchmarks.flood``.
 
-Two nodes of a closed team, each a process, call each other over loopback, while a third process sends 20,000
-datagrams a second to one of them from a thousand addresses: random bytes, well-formed handshakes without a valid mac,
-datagrams for a real session, recordings, DISCOVERY, PROBE and JOIN_REQUEST messages, and a mix of all. The program
-prints the share of answered calls, the delay of heartbeats, the bytes that the node sent to the attacker, its memory,
-and the processor time per forged datagram; it exits with 1 if a target is missed. Linux only, because it uses
+Two nodes of a closed team, each a process, call each other over loopback. Meanwhile a third process sends 20,000 forged
+datagrams a second to one of them from a thousand addresses. These are random bytes, well-formed handshakes without a
+valid mac, datagrams for a real session, recordings, DISCOVERY, PROBE and JOIN_REQUEST messages, and a mix of all. The
+program prints the share of answered calls, the delay of heartbeats, the bytes that the node sent to the attacker, its
+memory, and the processor time per forged datagram. It exits with 1 if a target is missed. Linux only, because it uses
 addresses of 127.0.0.0/8 and ``/proc``.
 """
 

@@ -1,7 +1,7 @@
 """Measure a put, a get and a join in processor time and datagrams, summed over all nodes of a team.
 
-All nodes are in one process, connected by a switchboard in virtual time, so the datagrams are the same on every machine
-and runs before and after a change can be compared. The time includes the simulation.
+All nodes are in one process, connected by a switchboard in virtual time, so the datagrams are the same on every
+machine. Therefore runs before and after a change can be compared. The time includes the simulation.
 """
 
 from __future__ import annotations

@@ -259,7 +259,7 @@ class BaseDriver:
     def _is_motion_permitted(self) -> bool:
         """Whether a motion is in force and its deadline has not passed.
 
-        Code that repeats a motion has to check this: after the node was frozen all timers are late, and the timer that
+        Code that repeats a motion has to check this. After the node was frozen, all timers are late, and the timer that
         repeats a motion may fire before the timer that ends the motion.
         """
         return self._gate.deadline is not None and not self._gate.is_motion_over(self._clock.seconds())

@@ -1,9 +1,9 @@
 """Find the driver of a kind of robot; a driver is imported only when its kind is used.
 
-A kind is built in, an entry point of ``swarm_node.drivers``, or a class given as ``module:name``.  A driver that is
-not built in is a class or another callable with the arguments (options, name, clock, connector).  Such a driver is
-third-party code and may fail in any way: its error is reported in one line that contains the name of the driver, and
-does not affect other drivers.
+A kind is built in, an entry point of ``swarm_node.drivers``, or a class given as ``module:name``.  A driver that is not
+built in is a class or another callable with the arguments (options, name, clock, connector).  Such a driver is
+third-party code and may fail in any way. Its error is reported in one line that contains the name of the driver, and
+does not affect the drivers of other kinds.
 """
 
 from __future__ import annotations

@@ -77,7 +77,7 @@ class Sessions(Protocol):
 
 
 class OpenSessions:
-    """Treat every user as an operator while ``can_serve``: for a page of this machine only, and for tests."""
+    """Treats every user as an operator while ``can_serve``; for tests, and for pages of this machine only."""
 
     code = ""
 

@@ -84,7 +84,7 @@ def find_refusal(
 ) -> Refusal | None:
     """Return why a request is rejected, or None.
 
-    ``has_csrf_header``: the request carries a header or content type that an HTML form cannot send.
+    ``has_csrf_header`` is whether the request carries a header or content type that an HTML form cannot send.
     ``is_allowed_origin`` accepts the origins of the team's other web nodes.
     """
     if not is_own_host(host, names):

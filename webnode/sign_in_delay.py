@@ -47,7 +47,7 @@ class SignInDelays:
         self._attempts.pop(get_network(source), None)
 
     def uncount_attempt(self, source: str) -> None:
-        """Uncount the last attempt of ``source``: it succeeded, but the earlier attempts still count."""
+        """Uncount the last attempt of ``source``, because it succeeded; the earlier attempts still count."""
         key = get_network(source)
         if key in self._attempts:
             count, last = self._attempts[key]

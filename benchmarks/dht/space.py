@@ -22,7 +22,7 @@ Fields = list[object]
 
 
 async def measure_space(workload: Workload) -> None:
-    """Put, read and take one tuple at a time; concurrent tuples of many writers; wake-ups; contested takes."""
+    """Measure single operations, concurrent puts of many writers, wake-ups, and takes by competing nodes."""
     if "space" not in workload.team.library.features:
         return
     count = workload.plan.scale_count(PUTS)

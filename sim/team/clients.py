@@ -31,7 +31,7 @@ T = TypeVar("T")
 def record_outcome(
     history: History, number: int, work: Deferred[T], shown: Callable[[T], object] = lambda result: None
 ) -> None:
-    """Record the outcome of ``work``, the request ``number``: ``shown(result)``, or the reason of its failure."""
+    """Record the result of the request ``number``, performed by ``work``, as ``shown(result)``, or its failure."""
 
     def failed(failure: Failure) -> None:
         failure.trap(EntangledError)

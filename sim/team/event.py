@@ -202,7 +202,7 @@ class OutcomeExpired(Event):
 
 @dataclass(frozen=True, slots=True)
 class OpenTask(Event):
-    """At the end of the run: an agent regards a task as open, and is in this state in the task."""
+    """At the end of the run an agent regards a task as open; ``state`` is the state of the agent in this task."""
 
     task: str
     place: int

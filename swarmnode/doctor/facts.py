@@ -31,8 +31,8 @@ class Probe:
 
     ``answer`` is its reply to a PROBE; ``is_member`` means that it also replied to a DISCOVERY of this team. ``error``
     is ``refused`` if the machine reported a closed port, ``unreachable`` if there is no route.  ``is_near`` is whether
-    the node is in a subnet of this machine, ``is_resolved`` whether its hardware address was resolved, ``is_tcp``
-    whether its machine replies to TCP, even if only with a refusal.
+    the node is in a subnet of this machine, and ``is_resolved`` whether its hardware address was resolved. ``is_tcp``
+    is whether its machine replies to TCP, even if only with a refusal.
     """
 
     address: Address

@@ -131,7 +131,7 @@ def get_key_folder() -> Path:
 
 
 def load_operator(named: Path | None) -> Operator:
-    """Load the operator's key in ``named``, by default the only one here; raises ``InvalidCommand``, ``BadKeyFile``."""
+    """Load the operator key from ``named`` (default: the only key); raises ``InvalidCommand`` or ``BadKeyFile``."""
     path = named or (Path(os.environ[OPERATOR_VARIABLE]) if os.environ.get(OPERATOR_VARIABLE) else None)
     if path is None:
         keys = sorted(get_key_folder().glob(f"*{KEY_FILE_SUFFIX}"))

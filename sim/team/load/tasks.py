@@ -1,4 +1,4 @@
-"""Workload: many simultaneous tasks; the few agents that sense a task bid for it (Assumption 1); one gets the lease.
+"""Workload: many simultaneous tasks; the few agents that sense a task bid (Assumption 1), and one gets the lease.
 
 Each task passes through all phases: council, bids, announcement, claim.
 """
