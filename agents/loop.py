@@ -81,7 +81,7 @@ class Agent(Service):
             age = max(0.0, seen.t_robot - seen.frame.t_robot) + self._clock.seconds() - seen.t_host
             self._node.streams.publish(CAMERA, seen.frame.seq, seen.frame.data, age)
         if self._robot.is_battery_empty or self._robot.is_estop_engaged or not self._node.stop_state.is_known:
-            return  # no report, because the robot could not act immediately
+            return  # no reports: the robot cannot act now
         for engagement in self._engagements_with_robot():
             if not engagement.is_over:
                 engagement.look(seen, self._clock.seconds())

@@ -464,7 +464,7 @@ for _name, _check in CHECKS.items():
 
 
 def find_violations(rig: Callable[[], Rig]) -> dict[str, str]:
-    """Return each broken rule with its message; an exception also breaks a rule. Each rule gets a new ``rig``."""
+    """Return each broken rule with its message; an exception also breaks a rule. Each check gets a new ``rig``."""
     found = {}
     for name, check in CHECKS.items():
         try:

@@ -17,8 +17,8 @@ class User:
     """The sender of a request; ``token_id`` names its session and is not secret.
 
     The session is valid until ``until`` and can be renewed until ``limit`` (both unix seconds); a ticket cannot renew
-    it. It also ends when one of the sessions in ``parents`` ends. ``vouchers`` are the keys of the web nodes that vouch
-    for it.
+    it. The session also ends when one of the sessions in ``parents`` ends. ``vouchers`` are the keys of the web nodes
+    that vouch for the session.
     """
 
     name: str = ""

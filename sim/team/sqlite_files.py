@@ -1,4 +1,4 @@
-"""Simulate nodes with stores in real SQLite files that lose power between any two instructions.
+"""Simulate nodes that have stores in real SQLite files and lose power between any two instructions.
 
 The writer has no thread: it commits at times of the simulated clock, so a run follows from its seed. A kill does not
 change the files, which may end with an incomplete commit; the next life of the node opens a copy.

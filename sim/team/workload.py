@@ -17,7 +17,7 @@ class Workload:
     """
 
     def step(self) -> None:
-        """Act; called repeatedly while the faults last."""
+        """Make the next requests; called repeatedly while faults occur."""
 
     def make_final_requests(self) -> None:
         """Make the final requests, after the faults and the repair interval; answers are awaited for 10 s."""

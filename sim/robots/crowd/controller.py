@@ -91,7 +91,7 @@ def stand(senses: Readings) -> Floats:
 
 
 def disperse(senses: Readings) -> Floats:
-    """Move away from everything that is near; stand if nothing is near."""
+    """Move away from all near objects; stand if nothing is near."""
     ranges = senses.ranges
     angle = np.arange(ranges.shape[1]) * (math.tau / ranges.shape[1])
     press = 1.0 - ranges / RAY_LENGTH_M
