@@ -83,7 +83,7 @@ def read_attributes(thing: object) -> list[Any]:
 
 
 def encode_motion(motion: MotionCapabilities) -> dict[str, Any]:
-    """Convert motion capabilities to plain values, except ``run``: the process decodes pictures itself."""
+    """Convert motion capabilities to plain values, without ``run``, because the process decodes pictures itself."""
     fields = {name: value for name, value in vars(motion).items() if name != "run"}
     return {name: dict(value) if isinstance(value, Mapping) else value for name, value in fields.items()}
 

@@ -56,7 +56,7 @@ class BehaviourConnection(Protocol):
 
 
 class BehaviourProxy:
-    """Performs the behaviour of the process at ``inner`` until that behaviour fails, then ``stand``."""
+    """Performs the behaviour of the process behind ``inner``; after a failure it always returns ``stand``."""
 
     _log = Logger()
 

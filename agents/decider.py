@@ -191,7 +191,7 @@ class Decider:
         return self._peers.members(now)
 
     def is_report_visible(self, now: float) -> bool:
-        """Return whether this agent's report is visible to the others."""
+        """Return whether this agent's report is visible to the other agents."""
         return self._panel.is_known(now)
 
     def update_reports(self, members: Sequence[Member], me: Member, now: float) -> Member:
@@ -203,7 +203,7 @@ class Decider:
         echo = self._peers.own_report
         if echo is None or (echo.epoch, echo.serial) <= (me.epoch, me.serial):
             return me
-        # An earlier run of this agent reached a higher count; the others ignore lower ones.
+        # An earlier run of this agent reached a higher count; the other agents ignore reports with lower counts.
         self._round_counter.advance(echo.epoch)
         return replace(me, epoch=echo.epoch, serial=echo.serial)
 
@@ -250,7 +250,7 @@ class Decider:
         return decision
 
     def is_first(self, now: float) -> bool:
-        """Return whether this agent does the group's duties: no agent executes the task, and its uuid is the lowest."""
+        """Return whether this agent does the group's duties: no agent executes the task and its uuid is the lowest."""
         others = self.others(now)
         return (
             self.is_report_visible(now)

@@ -26,7 +26,7 @@ class Decision:
     - ``assigned``: the uuid of the agent that should act, or None
     - ``digest``: the digest of the reports used
     - ``why``: the reason, for display
-    - ``order``: all agents that could act: the assigned one, then the standbys
+    - ``order``: all agents that could act, first the assigned one, then the standbys
     - ``basis``: all inputs of the decision; an equal basis gives an equal decision
     - ``fault``: the strategy's failure, if the fallback ``nearest`` decided instead
     - ``consensus``: the strategy's decision before the hysteresis was applied

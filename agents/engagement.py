@@ -188,7 +188,8 @@ class Engagement:
         self._execution.look(seen, now)
         if not self._is_free or self.is_over or self._execution.has_stalled(now):
             return
-        # In a group the robot may change tasks at any time, so a nearly finished task must report its reduced cost.
+        # In a group the robot may change tasks at any time. So its agent also reports a lower cost while it acts;
+        # otherwise a nearly finished task would seem expensive.
         is_acting = self.state_machine.state is State.EXECUTING and self.task_group is None
         news = self._report_builder.find_changes(self.me, is_acting, seen, now)
         if news is not None:

@@ -76,9 +76,9 @@ class Execution:
         return Step(action, math.floor(max(progress, self._best_progress) / PROGRESS_STEP + 1e-9) * PROGRESS_STEP)
 
     def has_stalled(self, now: float) -> bool:
-        """Return whether there was no progress for ``stall_limit`` seconds, or the execution stalled within that time.
+        """Return whether a stall, ``stall_limit`` seconds without progress, was detected recently.
 
-        During this time another agent may execute the task.
+        For ``stall_limit`` seconds after the detection another agent may execute the task.
         """
         return now - self._stalled_at < self._stall_limit
 

@@ -1,9 +1,10 @@
 """Assign posts to the robots that do not act, for the best joint view (thesis, section 4.2.5); pure.
 
-All robots have the target and compass north in common: from its compass and the bearing of the target each robot
-computes its own direction as seen from the target. The posts are evenly spaced around the target, in the robots'
-current order, so that no paths cross; the assigned robot does not move. Until the target is seen, each robot searches
-its own sector. The formation changes only after a member has left, to close the gap.
+A post is the place of one robot around the target. All robots have the target and compass north in common: from its
+compass and the bearing of the target each robot computes its own direction as seen from the target. The posts are
+evenly spaced around the target, in the robots' current order, so that no paths cross; the assigned robot does not move.
+Until the target is seen, each robot searches its own sector. The formation changes only after a member has left, to
+close the gap.
 """
 
 from __future__ import annotations
@@ -43,7 +44,8 @@ def assign_posts(angles: Sequence[tuple[str, float]], assigned: str | None) -> d
     step = math.tau / max(1, len(order))
     fixed = next((n for n, (uuid, _) in enumerate(order) if uuid == assigned), None)
     if fixed is None:
-        # Each robot's preferred rotation of the posts; with the circular mean the robots move least in total.
+        # The rotations that would put each robot's post at its present direction; with their circular mean the robots
+        # move least in total.
         preferred_turns = [angle - n * step for n, (_, angle) in enumerate(order)]
         turn = math.atan2(sum(map(math.sin, preferred_turns)), sum(map(math.cos, preferred_turns)))
     else:
@@ -103,8 +105,8 @@ MIN_CIRCLING_RADIUS_M = 0.45
 class PostPath:
     """The path of one robot to its post around the target at constant distance, in short chords.
 
-    Camera and ranger of a robot look only ahead, so the robot turns along the circle, walks a chord while the path is
-    free, and turns back to the target before the next chord. A robot without a ranger does not move.
+    Camera and ranger of a robot look only ahead, so the robot turns along the circle and walks a chord while the path
+    is free. Before the next chord it turns back to the target. A robot without a ranger does not move.
     """
 
     def __init__(self, motion: MotionCapabilities | None = None) -> None:

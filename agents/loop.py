@@ -81,7 +81,7 @@ class Agent(Service):
             age = max(0.0, seen.t_robot - seen.frame.t_robot) + self._clock.seconds() - seen.t_host
             self._node.streams.publish(CAMERA, seen.frame.seq, seen.frame.data, age)
         if self._robot.is_battery_empty or self._robot.is_estop_engaged or not self._node.stop_state.is_known:
-            return  # the robot could not act immediately, and the other agents would rely on the report
+            return  # no reports: the robot cannot act now
         for engagement in self._engagements_with_robot():
             if not engagement.is_over:
                 engagement.look(seen, self._clock.seconds())
@@ -158,7 +158,7 @@ class Agent(Service):
             each.engagement.set_robot_lent(each in parts and each is not part, self._clock.seconds())
 
     def _group_by_urgency(self, active: list[Participation]) -> dict[Participation, list[Participation]]:
-        """Return the most urgent part of each group, with all parts of the group.
+        """Return the most urgent participation of each group, together with all participations in the group.
 
         A task without a group forms a group of its own.
         """
@@ -311,10 +311,10 @@ class Agent(Service):
 
 
 def select_participation(parts: list[Participation], holder: Participation | None) -> Participation:
-    """Return the part of a group that should get the robot: the part assigned to it, else a part with unknown cost.
+    """Return the participation that should get the robot: the one assigned to it, else one with unknown cost.
 
-    ``parts`` has at least one entry and is sorted by urgency; ``holder`` has the robot now, and may be outside of
-    ``parts``.
+    ``parts`` are the participations of a group: at least one, sorted by urgency. ``holder`` is the participation that
+    has the robot now; it may be outside of ``parts``.
     """
     own = holder if holder in parts else None
     if own is not None and (own.engagement.is_acting or not own.engagement.can_yield_robot):

@@ -79,7 +79,7 @@ class CouncilMaintainer:
 
 
 def _ignore_unreachable(failure: Any) -> None:
-    """Ignore that too few members answered or that the lease is claimed: the council maintainer tries again."""
+    """Ignore that too few members answered, or that the lease is claimed; the council maintainer tries again."""
     failure.trap(EntangledError)
 
 
@@ -159,7 +159,7 @@ class Participation:
         proved.addErrback(self._retry_record_outcome, result)
 
     def _retry_record_outcome(self, failure: Any, result: Result) -> None:
-        """Try again as long as this agent is permitted to record the outcome; no majority could be reached."""
+        """Try again because no majority could be reached, as long as this agent is permitted to record the outcome."""
         failure.trap(EntangledError)
         if failure.check(Superseded) is not None:
             self.engagement.apply_event(Event.REOPENED, self._clock.seconds())

@@ -86,7 +86,7 @@ class AgentRobot:
         return self.is_enabled and has_motors and now - self._responded_at <= RESPONSE_TIMEOUT_S
 
     def perform(self, command: RobotCommand) -> bool:
-        """Perform ``command``; return False if the robot has obeyed a newer fencing token: another agent may act."""
+        """Perform ``command``; return False if the robot has obeyed a newer token, so another agent may act."""
         if self.driver.state != "ready":
             return True
         try:

@@ -261,7 +261,7 @@ class SearchAndApproach:
         return believed
 
     def _detect_stuck(self, now: float) -> None:
-        """Treat it as a bump if a robot without a ranger walks but does not move."""
+        """If a robot without a ranger walks but does not move, handle this as a bump."""
         is_walking = self._motion.is_walking and not self._motion.ranges and now - self._called_at < STUCK_TIME_S / 2
         self._called_at = now
         if not is_walking or math.dist(self._last_moved[0][:2], self._pose[:2]) > STUCK_DISTANCE_M:

@@ -1,9 +1,9 @@
 """Assign the open tasks of a group jointly to the agents that can do them; pure.
 
-Each agent computes the assignment of the whole group from the reports on all its tasks, and then uses the part of each
-task. The digest of a decision therefore covers the reports on all these tasks. An acting agent is considered only for
-its own task, at a cost reduced by the task's hysteresis, so a task of a group is reassigned under the same condition
-as a task without a group.
+Each agent computes the assignment of the whole group from the reports on all its tasks, and takes the decision for each
+task from it. The digest of a decision therefore covers the reports on all these tasks. An acting agent is considered
+only for its own task, at a cost reduced by the task's hysteresis. So a task of a group is reassigned under the same
+condition as a task without a group.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ GetMembers = Callable[[float], Sequence[Member]]
 def get_group_key(task: Task) -> GroupKey | None:
     """Return the key of the tasks that are assigned jointly with ``task``; None for a task without a group.
 
-    The key contains the group, the strategy and the requirements, so every agent that takes part in one of these tasks
-    takes part in all of them and receives the reports on all of them.
+    The key contains the group, the strategy and the requirements. So every agent that takes part in one of these tasks
+    takes part in all of them, and receives all their reports.
     """
     if not task.group:
         return None

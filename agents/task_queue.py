@@ -1,7 +1,7 @@
 """The tasks that one agent knows: the open ones in order of urgency, and the finished ones; pure.
 
-A task that is over never starts again, even if a late record of the task arrives: its tombstone is kept longer than
-any lease and any tolerated absence of a node, and at least as long as the task is listed.
+A task that is over never starts again, even if a late record of the task arrives. Its tombstone is kept longer than any
+lease and any tolerated absence of a node, and at least as long as the task is listed.
 """
 
 from __future__ import annotations

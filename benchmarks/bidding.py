@@ -1,8 +1,8 @@
 """Measure bidding for up to 10,000 agents: messages, time and agreement.
 
-The bidding code and the routing tables are production code. The links are simulated by a heap of events, with a
-one-way delay of 20 ms + Exp(10 ms) and independent loss; messages are retransmitted at the same times as by the
-endpoint. Signatures are omitted, because they affect only processor time.
+The bidding code and the routing tables are production code. The links are simulated by a heap of events, with a one-way
+delay of 20 ms + Exp(10 ms) and independent loss; messages are retransmitted after the same delays as in the endpoint.
+Signatures are omitted, because they affect only processor time.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class LinkFaults:
 
 @dataclass
 class Outcome:
-    """The result of an auction; ``took``: seconds from the waiting period to the right decision, for each agent."""
+    """The result of an auction; ``took`` has each agent's seconds from the waiting period to the right decision."""
 
     messages: float
     busiest: int

@@ -170,7 +170,7 @@ TEAM_HEADER = [
 
 
 def run_team(n: int, seed: int) -> Iterator[list[str]]:
-    """Yield rows of a team of real nodes that settles, loses a quarter at once, and shrinks gracefully to 40."""
+    """Yield rows of a team of real nodes that settles, loses a quarter simultaneously, and shrinks gracefully to 40."""
     team = Team(n, seed)
     team.clock.advance(40.0)
     yield team.make_row("settled")

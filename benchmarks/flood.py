@@ -1,10 +1,10 @@
 """Send forged datagrams to a node: ``python -m benchmarks.flood``.
 
-Two nodes of a closed team, each a process, call each other over loopback, while a third process sends 20,000
-datagrams a second to one of them from a thousand addresses: random bytes, well-formed handshakes without a valid mac,
-datagrams for a real session, recordings, DISCOVERY, PROBE and JOIN_REQUEST messages, and a mix of all. The program
-prints the share of answered calls, the delay of heartbeats, the bytes that the node sent to the attacker, its memory,
-and the processor time per forged datagram; it exits with 1 if a target is missed. Linux only, because it uses
+Two nodes of a closed team, each a process, call each other over loopback. Meanwhile a third process sends 20,000 forged
+datagrams a second to one of them from a thousand addresses. These are random bytes, well-formed handshakes without a
+valid mac, datagrams for a real session, recordings, DISCOVERY, PROBE and JOIN_REQUEST messages, and a mix of all. The
+program prints the share of answered calls, the delay of heartbeats, the bytes that the node sent to the attacker, its
+memory, and the processor time per forged datagram. It exits with 1 if a target is missed. Linux only, because it uses
 addresses of 127.0.0.0/8 and ``/proc``.
 """
 
@@ -86,8 +86,8 @@ def make_generators(order: dict[str, Any]) -> dict[str, Callable[[], bytes]]:
 
     single: dict[str, Callable[[], bytes]] = {
         "random": lambda: some(rng.randrange(1, 1400)),
-        # Length and padding of a real INIT, with zeros instead of the mac, which needs the team's secret, and no
-        # payment.
+        # The length and padding are those of a real INIT. The mac, which needs the team's secret, is zeros, and there
+        # is no payment.
         "init": lambda: bytes([session.INIT]) + some(1283) + bytes(16),
         "data": data,
         "replay": lambda: rng.choice(recorded),

@@ -1,7 +1,7 @@
 """Measure a put, a get and a join in processor time and datagrams, summed over all nodes of a team.
 
-All nodes are in one process, connected by a switchboard in virtual time, so the datagrams are the same on every machine
-and runs before and after a change can be compared. The time includes the simulation.
+All nodes are in one process, connected by a switchboard in virtual time, so the datagrams are the same on every
+machine. Therefore runs before and after a change can be compared. The time includes the simulation.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class OperationBenchmark:
             self.team.clock.advance(STEP_S)
 
     def measure_each(self, work: Callable[[int], Deferred[Any]], times: int, wide: int = 1) -> str:
-        """Return the cost of one of ``times`` operations, ``wide`` of them in parallel, in the best quarter."""
+        """Run ``times`` operations, ``wide`` of them in parallel; return the cost of one in the best quarter."""
         self.failed = 0
         gc.collect()
         sent, moment = self.team.total_traffic.sent, self.team.clock.seconds()

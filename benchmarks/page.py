@@ -1,10 +1,10 @@
 """Load the page: ``python -m benchmarks.page``.
 
-The load is 200 event streams, 12 camera viewers of three robots at 30 pictures a second, 500 clients that send a byte
-a second, and 100 requests a second, each kind from 64 addresses of this machine, and one viewer on a slow link. The
-program prints the starved streams, the age of pictures, the delay of the web node's timers and its memory, and exits
-with 1 if a target is missed. The age of a picture is measured from the robot's process, over UDP and the web node, to
-the viewer's process; it does not include the camera and the screen.
+The load is 200 event streams, 12 camera viewers of three robots at 30 pictures a second, 500 clients that send a byte a
+second, and 100 requests a second, each kind from 64 addresses of this machine. In addition there is one viewer on a
+slow link. The program prints the starved streams, the age of pictures, the delay of the web node's timers and its
+memory, and exits with 1 if a target is missed. The age of a picture is measured from the robot's process, over UDP and
+the web node, to the viewer's process; it does not include the camera and the screen.
 """
 
 from __future__ import annotations
@@ -242,7 +242,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--rate", type=float, default=100.0, help="requests a second")
     args = parser.parse_args(arguments)
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
-    # Both ends of each connection are files; the child processes inherit this limit.
+    # Both ends of each connection count as open files; the child processes inherit this limit.
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(4096, most), most))
     udp, where = (
         free_ports.find_free_ports("udp", "127.0.0.1", 1)[0],

@@ -1,4 +1,4 @@
-"""Measure the driving of three AIBOs at once, over their own protocol.
+"""Measure the simultaneous driving of three AIBOs over their own protocol.
 
 ``make bench-robots`` starts a simulator that emulates three robots, and for each robot a process that only drives it.
 It prints the regularity of world states and pictures, the time of a command from the driver's ``act`` to the legs, and

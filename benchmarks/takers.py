@@ -1,7 +1,8 @@
 """Check under faults that many takers confirm each tuple at most once and lose no tuple (virtual time, from a seed).
 
 ``python -m benchmarks.takers --tuples 10000 --takers 8 --loss 0.0-0.5`` runs complete nodes on a switchboard that loses
-datagrams, while nodes are killed and return and links are cut; it prints a table and exits with 1 on a violation.
+datagrams. Meanwhile nodes are killed and return, and links are cut. The command prints a table, and exits with 1 on a
+violation.
 """
 
 from __future__ import annotations

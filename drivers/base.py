@@ -175,7 +175,7 @@ class BaseDriver:
         return fail(Unsupported(f"{self._name} has no skill {name!r}; its skills are {known}"))
 
     def diagnostics(self) -> dict[str, float]:
-        """Return counters: frames, bad frames, pictures, bytes, links, reconnects, refused; and ``age``.
+        """Return counters (frames, bad frames, pictures, bytes, links, reconnects, refused) and ``age``.
 
         ``age`` is the age of the newest observation in seconds. ``accepted`` counts the commands that this driver
         accepted, ``lower token`` and ``late`` those that it refused. With a dead man's switch, ``halts`` is the number
@@ -259,7 +259,7 @@ class BaseDriver:
     def _is_motion_permitted(self) -> bool:
         """Whether a motion is in force and its deadline has not passed.
 
-        Code that repeats a motion has to check this: after the node was frozen all timers are late, and the timer that
+        Code that repeats a motion has to check this. After the node was frozen, all timers are late, and the timer that
         repeats a motion may fire before the timer that ends the motion.
         """
         return self._gate.deadline is not None and not self._gate.is_motion_over(self._clock.seconds())

@@ -213,7 +213,7 @@ def check_clips(rig: Rig) -> None:
 
 
 def check_keeps(rig: Rig) -> None:
-    """A key that an action omits keeps its value as long as the last command is in force; it is zero after a stop."""
+    """A key that an action omits keeps its value while the last command is in force; the value is zero after a stop."""
     driver = _make_ready_driver(rig)
     axis = _select_axis(driver)
     if not axis:
@@ -464,7 +464,7 @@ for _name, _check in CHECKS.items():
 
 
 def find_violations(rig: Callable[[], Rig]) -> dict[str, str]:
-    """Return each broken rule with its message; an exception also breaks a rule. Each rule gets a new ``rig``."""
+    """Return each broken rule with its message; an exception also breaks a rule. Each check gets a new ``rig``."""
     found = {}
     for name, check in CHECKS.items():
         try:

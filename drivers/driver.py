@@ -90,7 +90,7 @@ class Driver(Protocol):
         """
 
     def diagnostics(self) -> dict[str, float]:
-        """Return counters: frames, bad frames, bytes, reconnects; and ``age``, of the newest observation, in seconds.
+        """Return counters (frames, bad frames, bytes, reconnects), and the newest observation's ``age`` in seconds.
 
         ``accepted`` counts the accepted commands, ``lower token`` and ``late`` the refused commands by reason.
         """

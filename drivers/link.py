@@ -185,8 +185,8 @@ class TcpConnector:
     """Opens links over TCP on ``reactor`` (None: the running one).
 
     ``waits`` are the delays in seconds before each retry, of which the last one is repeated; without ``waits`` the
-    delays grow exponentially. With ``says`` the reason why a link cannot be opened is logged, once until the link
-    opens.
+    delays grow exponentially. With ``says`` the reason why a link cannot be opened is logged, and not repeated until a
+    link has opened.
     """
 
     def __init__(self, reactor: Any = None, waits: Sequence[float] = (), says: bool = False) -> None:
@@ -213,8 +213,8 @@ class _TcpReconnector(protocol.ReconnectingClientFactory):
     """Reconnect with Twisted's older factory; ``ClientService`` has no advantage here and takes 0.6 MiB more per node.
 
     ``problem`` is the reason in one line why no link is open; it is empty while a link is open and before the first
-    attempt ends. The delay is reset only by a link that received data or lasted ``MAX_RETRY_S``, so a server that
-    accepts and immediately closes connections is not retried more often than a server that refuses connections.
+    attempt ends. Only a link that received data or lasted ``MAX_RETRY_S`` resets the delay. So a server that accepts
+    and immediately closes connections is not retried more often than a server that refuses connections.
     """
 
     noisy = False
@@ -323,7 +323,7 @@ class MemoryLink:
 class MemoryConnector:
     """Opens links to ``accept`` through ``clock``; host and port are ignored.
 
-    With ``is_open`` False new links are refused; ``cut`` breaks open links; ``block_data`` drops their data.
+    If ``is_open`` is False, new links are refused. ``cut`` breaks the open links, ``block_data`` drops their data.
     """
 
     def __init__(self, clock: IReactorTime, accept: Accept, delay: float = 0.0005) -> None:

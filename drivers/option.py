@@ -23,9 +23,10 @@ Device = Annotated[str, Meta(min_length=1, description="a serial device", exampl
 class Manifest:
     """One kind of robot; the constant ``MANIFEST`` of its module ``driver``.
 
-    ``library`` is the additional module that the kind needs, ``extra`` the extra of this distribution that installs
-    the module, ``when`` the case in which the module is needed (empty: always). ``example`` contains options of such a
-    robot, and is empty if no options are required. ``is_on_cable``: the option ``port`` may be a serial device.
+    ``library`` is the additional module that the kind needs, ``extra`` the extra of this distribution that installs the
+    module, ``when`` the case in which the module is needed (empty: always). ``example`` contains options of such a
+    robot, and is empty if no options are required. ``is_on_cable`` is whether the option ``port`` may be a serial
+    device.
     """
 
     library: str = ""

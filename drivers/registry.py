@@ -1,9 +1,9 @@
 """Find the driver of a kind of robot; a driver is imported only when its kind is used.
 
-A kind is built in, an entry point of ``swarm_node.drivers``, or a class given as ``module:name``.  A driver that is
-not built in is a class or another callable with the arguments (options, name, clock, connector).  Such a driver is
-third-party code and may fail in any way: its error is reported in one line that contains the name of the driver, and
-does not affect other drivers.
+A kind is built in, an entry point of ``swarm_node.drivers``, or a class given as ``module:name``.  A driver that is not
+built in is a class or another callable with the arguments (options, name, clock, connector).  Such a driver is
+third-party code and may fail in any way. Its error is reported in one line that contains the name of the driver, and
+does not affect the drivers of other kinds.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def load_factory(kind: str, place: str) -> Factory:
 
 
 def get_description(make: Factory, options: Mapping[str, object], name: str) -> Description:
-    """Return the description of such a robot, by creating a temporary driver, which opens no links."""
+    """Return the description of a robot from a temporary driver, which ``make`` creates and which opens no links."""
     return make(options, name, Clock(), None).description
 
 

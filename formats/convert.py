@@ -107,7 +107,7 @@ def convert_field(value: object, cls: type[Any], key: str, is_text: bool = False
 def convert_value(value: object, hint: Any, key: str = "", default: object = None, is_text: bool = False) -> Any:
     """Convert ``value`` to the type ``hint``; raise ``InvalidValue`` with ``key``, and with ``default`` as the example.
 
-    ``is_text``: the value is a command-line argument, in which commas separate the entries of a list.
+    With ``is_text`` the value is a command-line argument, in which commas separate the entries of a list.
     """
     extra = getattr(hint, "__metadata__", ())
     raw = get_raw_type(hint)

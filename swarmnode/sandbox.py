@@ -56,7 +56,7 @@ def find_allowed_imports(source: bytes) -> list[str]:
 
 def _prepare(parent: int, source: bytes) -> list[str]:
     for name in find_allowed_imports(source):
-        with suppress(Exception):  # the same import in the pushed module raises again
+        with suppress(Exception):  # the pushed module's own import raises the same error
             importlib.import_module(name)
     os.environ.clear()
     sys.path.clear()

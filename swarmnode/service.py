@@ -47,7 +47,7 @@ class NodeService(Service):
         super().stopService()
         if self._rejoin_call is not None and self._rejoin_call.active():
             self._rejoin_call.cancel()
-        # The agent releases its lease while the node still runs, so another device continues at once.
+        # The agent releases its lease while the node still runs, so another device continues immediately.
         ended = self._stop_agent().addBoth(lambda _: self.assembly.node.stopService())
         down = gatherResults([ended, self._stop_fronts()])
         return down.addBoth(lambda _: self._dependencies.store.close())

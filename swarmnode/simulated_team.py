@@ -169,7 +169,7 @@ class SimulatedTeam(Simulation):
         self.machines[name].thaw()
 
     def block_datagrams(self, name: str, one_way: bool = False) -> None:
-        """Block all datagrams between a node and the others; with ``one_way`` it still receives."""
+        """Block all datagrams between a node and the other nodes; with ``one_way`` the node still receives."""
         for other in self._names:
             if other != name:
                 self.switchboard.cut(self.address_of(name), self.address_of(other), one_way)

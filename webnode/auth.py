@@ -16,8 +16,9 @@ Role = Literal["anyone", "viewer", "operator", "phone"]
 class User:
     """The sender of a request; ``token_id`` names its session and is not secret.
 
-    The session is valid ``until`` (unix seconds) and can be renewed up to ``limit``, but not with a ticket.  It ends
-    with the sessions ``parents``; ``vouchers`` are the keys of the web nodes that vouch for it.
+    The session is valid until ``until`` and can be renewed until ``limit`` (both unix seconds); a ticket cannot renew
+    it. The session also ends when one of the sessions in ``parents`` ends. ``vouchers`` are the keys of the web nodes
+    that vouch for the session.
     """
 
     name: str = ""
@@ -76,7 +77,7 @@ class Sessions(Protocol):
 
 
 class OpenSessions:
-    """Treat every user as an operator while ``can_serve``: for a page of this machine only, and for tests."""
+    """Treats every user as an operator while ``can_serve``; for tests, and for pages of this machine only."""
 
     code = ""
 

@@ -24,7 +24,7 @@ class CameraStream:
     """The newest picture of one device, and the requests that wait for the next one.
 
     ``open_upstream`` may raise ``Refusal``.  An upstream that is silent for ``POLL_S`` is reopened, because the device
-    may have a new address.  A camera ends two seconds after its last request.
+    may have a new address.  The stream ends two seconds after its last request.
     """
 
     def __init__(

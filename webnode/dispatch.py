@@ -26,7 +26,7 @@ class Dispatch:
         # A route that a viewer may call changes nothing, whatever its method.
         if route.method == "GET" or route.role == "viewer":
             return self._call(route, request)
-        # Unauthenticated clients share one identity: a stored answer must not reach another client.
+        # Unauthenticated clients share one identity, so a stored answer could reach a different client.
         if not request.id or route.role == "anyone":
             return self._call_audited(route, request)
         key = request.user.token_id, route.name, request.id

@@ -67,7 +67,8 @@ class EventLog:
         titles = {task["id"]: task["title"] for task in _rows(state, "tasks")}
         self._compare_tasks(_index_rows(before, "tasks", "id"), _rows(state, "tasks"), now)
         ended = {task["id"] for task in _rows(state, "tasks") if task["status"] in ENDED_STATUSES}
-        # Reports on a task that has ended expire one after another; agreement among the rest means nothing.
+        # Reports on a task that has ended expire one after another; agreement among the remaining reports means
+        # nothing.
         open_groups = [group for group in _rows(state, "groups") if group["task"] not in ended]
         self._compare_groups(_index_rows(before, "groups", "task"), open_groups, now)
         self._find_takeovers(state, titles, ended, now)

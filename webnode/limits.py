@@ -1,4 +1,4 @@
-"""Limit the connections and requests that one address may have open at once."""
+"""Limit the connections and requests that one address may have open at the same time."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
 """Check which requests a page on a LAN may answer, and set strict security headers.  Pure.
 
-The page uses no cookies, so another site can only send requests through a user's browser.  Three checks stop them:
-``Host`` must be an address or a name of this machine (against DNS rebinding), ``Origin`` must be the page's own or
-belong to another web node of the team, and a request that changes something must be of a kind that an HTML form cannot
-send.
+The page uses no cookies, so another site can only send requests through a user's browser.  Three checks stop such
+requests: ``Host`` must be an address or a name of this machine (against DNS rebinding), ``Origin`` must be the page's
+own or belong to another web node of the team, and a request that changes something must be of a kind that an HTML form
+cannot send.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def find_refusal(
 ) -> Refusal | None:
     """Return why a request is rejected, or None.
 
-    ``has_csrf_header``: the request carries a header or content type that an HTML form cannot send.
+    ``has_csrf_header`` is whether the request carries a header or content type that an HTML form cannot send.
     ``is_allowed_origin`` accepts the origins of the team's other web nodes.
     """
     if not is_own_host(host, names):

@@ -56,7 +56,7 @@ class SignedSessions:
     a valid session also works as a code, for the same role and until the same time: this is an invitation.  ``key``
     signs for this web node.  ``can_authenticate`` returns whether the node with a public key is a gateway of the team
     now; a session is valid while all its vouchers are, this node included.  ``revocations`` are the sessions that were
-    ended; a session lasts ``session_s``, and as long again when it is renewed.
+    ended; a session lasts ``session_s``, and for the same time after each renewal.
     """
 
     def __init__(

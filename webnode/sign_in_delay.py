@@ -14,9 +14,9 @@ MAX_SOURCES = 4096
 class SignInDelays:
     """Failed attempts per source address; ``now`` is in seconds.
 
-    Ten attempts are free; then the pause before the next doubles from 4 s up to an hour, which limits guesses to 20 in
-    the first hour.  An address is forgotten after a day without an attempt; if there are too many addresses, the one
-    idle for longest is forgotten first.  The arguments replace these defaults.
+    Ten attempts are free. The pause before the next attempt is then 4 s, and doubles with each attempt up to an hour,
+    which limits guesses to 20 in the first hour.  An address is forgotten after a day without an attempt; if there are
+    too many addresses, the one idle for longest is forgotten first.  The arguments replace these defaults.
     """
 
     def __init__(self, free: int = FREE_ATTEMPTS, longest_s: float = LONGEST_S, forgotten_s: float = FORGET_S) -> None:
@@ -47,7 +47,7 @@ class SignInDelays:
         self._attempts.pop(get_network(source), None)
 
     def uncount_attempt(self, source: str) -> None:
-        """Uncount the last attempt of ``source``: it succeeded, but the earlier attempts still count."""
+        """Uncount the last attempt of ``source``, because it succeeded; the earlier attempts still count."""
         key = get_network(source)
         if key in self._attempts:
             count, last = self._attempts[key]

@@ -96,7 +96,7 @@ def _make_task_row(task: Task, progress: Progress, view: TeamView) -> dict[str, 
 
 
 def _make_stop_view(stops: Mapping[str, str], devices: Iterable[State]) -> State:
-    """Return ``halted``, and in ``halt`` the stops, the robots that stand still, and the reports of the others.
+    """Return ``halted``, and in ``halt`` the stops, the robots that stand still, and the reports of all other robots.
 
     ``halted`` is true only if every robot confirms that it stands still for every stop in force.  A stop that is
     ordered but not confirmed is shown as such, and so is a robot that has not received a release.  ``stops`` (id to

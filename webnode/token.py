@@ -37,8 +37,9 @@ class Claim:
     """The content of a token.
 
     ``id`` names the session, ``parents`` the sessions or invitations from which it is derived and with which it ends.
-    ``until`` is the expiry, ``limit`` the latest expiry of a renewed token, both in whole unix seconds.  ``is_ticket``:
-    the token is for the query of a GET.  ``vouchers`` are the public keys of the web nodes that vouch for it.
+    ``until`` is the expiry, ``limit`` the latest expiry of a renewed token, both in whole unix seconds.  ``is_ticket``
+    is whether the token is for the query of a GET.  ``vouchers`` are the public keys of the web nodes that vouch for
+    it.
     """
 
     id: str

@@ -171,8 +171,9 @@ class Bidder:
 def is_final(rounds: int, quiet: int, tasks: int, members: int) -> bool:
     """Return whether the result is final after ``rounds`` synchronous rounds, the last ``quiet`` without changes.
 
-    Rounds without changes are not a proof, because distant agents may still change their bids. The bound is the number
-    of tasks times the diameter of the graph (Choi and others, theorem 1), without message loss.
+    Rounds without changes are not a proof, because distant agents may still change their bids. Without message loss,
+    the result is final after as many rounds as the number of tasks times the diameter of the graph (Choi and others,
+    theorem 1).
     """
     return rounds > tasks * max(1, members - 1)
 

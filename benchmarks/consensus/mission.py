@@ -64,7 +64,7 @@ class Mission:
 
     @cached_property
     def nearest_tasks(self) -> dict[str, list[tuple[float, str]]]:
-        """For each agent the distance to each task in metres, and the task, the nearest first."""
+        """For each agent, pairs of the distance to a task in metres and the task, the nearest first."""
         return {
             a: sorted((math.dist(s, p), t) for t, p in self.task_positions.items())
             for a, s in self.agent_positions.items()

@@ -30,7 +30,7 @@ def solve_assignment(mission: Mission) -> tuple[float, str]:
 
 
 def search_routes(mission: Mission, ways: dict[str, list[str]], seconds: float) -> tuple[float, str]:
-    """Return the shortest known sum of routes through all tasks, and the solver's name, starting from ``ways``."""
+    """Improve the routes ``ways`` through all tasks; return the sum of their lengths, and the solver's name."""
     try:
         return min(measure_routes(mission, ways), _solve_with_ortools(mission, seconds)), "OR-Tools"
     except ImportError:

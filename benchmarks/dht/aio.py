@@ -57,5 +57,5 @@ class AsyncioPeer:
         raise NotImplementedError("this library has no tuple space")
 
     def drop_datagrams(self, share: float) -> None:
-        """Raise ``NotImplementedError``: their sockets are not accessible."""
+        """Raise ``NotImplementedError``: the sockets of these libraries are not accessible."""
         raise NotImplementedError("the sockets of this library are not accessible")

@@ -58,8 +58,8 @@ class Library:
     """One column of the comparison.
 
     ``package`` is the module that must be importable; ``guarantee`` is the guarantee of a finished put; ``largest`` is
-    the documented maximum length of a value in bytes; ``survives`` lists the failures that a store on disk survives,
-    if it does not survive a loss of power; ``features`` lists the features besides put and get.
+    the documented maximum length of a value in bytes; ``survives`` lists the failures that a store on disk survives, if
+    a loss of power is not one of them; ``features`` lists the features besides put and get.
     """
 
     name: str
@@ -82,7 +82,7 @@ class Library:
 
     @property
     def is_installed(self) -> bool:
-        """Return whether its library can be imported."""
+        """Return whether the library can be imported."""
         return importlib.util.find_spec(self.package) is not None
 
     def make_node(self, folder: str) -> LibraryNode:

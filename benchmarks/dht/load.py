@@ -13,8 +13,8 @@ MAX_BATCH = 64
 class Load:
     """Keep ``order["in_flight"]`` operations open for ``order["seconds"]``, each item ``once`` or repeatedly.
 
-    An operation is good only if it ended successfully and in time, not if it was still open at the end or not started.
-    If each item is used once, "done" lists the good operations.
+    An operation is good only if it ended successfully and in time. Operations that were still open at the end, or were
+    not started, are not good. If each item is used once, "done" lists the good operations.
     """
 
     def __init__(

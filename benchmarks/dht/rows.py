@@ -40,7 +40,7 @@ def read_join_ms(result: Result) -> float | None:
 
 
 def read_slowest_ms(result: Result) -> float | None:
-    """Return the longest successful operation, under load and losses included, in ms."""
+    """Return the duration of the longest successful operation in ms, also under load and after node failures."""
     names = (("put",), ("get",), ("gets",), ("puts",), *((a, b) for a in LOSSES for b in FAILED_PARTS))
     found = [ms for name in names if (ms := make_reader(*name, "max")(result)) is not None]
     return max(found) if found else None

@@ -22,7 +22,7 @@ Fields = list[object]
 
 
 async def measure_space(workload: Workload) -> None:
-    """Put, read and take one tuple at a time; concurrent tuples of many writers; wake-ups; contested takes."""
+    """Measure single operations, concurrent puts of many writers, wake-ups, and takes by competing nodes."""
     if "space" not in workload.team.library.features:
         return
     count = workload.plan.scale_count(PUTS)
@@ -83,7 +83,7 @@ async def _measure_wakeups(workload: Workload) -> Result:
 
 
 async def _measure_races(workload: Workload) -> Result:
-    """Let several nodes take one tuple at once; count the races with exactly one winner."""
+    """Let several nodes take one tuple at the same time; count the races with exactly one winner."""
     single = 0
     count = workload.plan.scale_count(RACES)
     for number in range(count):

@@ -90,7 +90,7 @@ def get_own_result(row: Row) -> Result:
 
 
 def make_own_reader(read: Reader) -> RowReader:
-    """Return a reader of ``read`` in the results of this library."""
+    """Return a function that applies ``read`` to the results of this library."""
     return lambda row: read(get_own_result(row))
 
 
@@ -105,7 +105,7 @@ def make_peer_reader(read: Reader, *names: str, factor: float) -> RowReader:
 
 
 def count_idle_phases(result: Result) -> float | None:
-    """Return the number of phases without results: every operation failed, or the failures could not be tested."""
+    """Return the number of phases without results: all operations failed, or a test of node failures ended early."""
     idle = [name for name in OPERATIONS if name in result and result[name]["tried"] == result[name]["failed"]]
     stuck = [loss for loss in LOSSES if "trouble" in result.get(loss, {})]
     return float(len(idle) + len(stuck)) if result else None

@@ -31,7 +31,7 @@ class Node(RemoteProcess):
 
 
 class Team:
-    """The nodes of one contestant; ``async with`` spawns the processes and ends them, orders start the nodes."""
+    """The nodes of one library; ``async with`` spawns and ends their processes; orders start the nodes."""
 
     def __init__(self, entry: Library, size: int, folder: str) -> None:
         self.library = entry

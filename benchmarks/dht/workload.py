@@ -92,7 +92,7 @@ class Workload:
             await self.store_until_found(node, nodes[number - 1], f"ready {number}")
 
     async def store_until_found(self, writer: Node, reader: Node, key: str) -> tuple[str, str]:
-        """Store a new value, with retries, until another node finds it; return both; raises ``OrderFailed``."""
+        """Store new values until ``reader`` finds one; return its key and the value; raises ``OrderFailed``."""
         for number in range(MAX_TRIES):
             value = self.make_value()
             put = await self.run_operation(writer, "put", f"{key} try {number}", value)
@@ -139,7 +139,7 @@ class Workload:
     # -- phases -----------------------------------------------------------------------------------------------------
 
     async def run_healthy(self) -> bool:
-        """Join, rest, single operations, concurrent operations, memory; return False if the join failed."""
+        """Measure joins, the idle network, single and concurrent operations, memory; return False if a join failed."""
         joiners = min(JOINERS, len(self.nodes) - 2)
         async with self.phase("join", 3 * PHASE_LIMIT_S):
             await self.start_nodes(self.nodes[: len(self.nodes) - joiners])
@@ -202,7 +202,7 @@ class Workload:
         return held
 
     async def _measure_load(self, items: list[tuple[str, str]], held: list[list[bool | None]]) -> None:
-        """Measure the operations that one node completes with that many in flight."""
+        """Measure the operations that one node completes with a given number of operations in flight."""
         loaded = self.nodes[len(self.nodes) // 2]
         mine = held[len(self.nodes) // 2]
         # In a small network a node stores nearly all keys: then its reads are local.

@@ -135,7 +135,7 @@ class Trial:
         return outcome
 
     async def record_path(self) -> None:
-        """Record the present path between them."""
+        """Record the present path between the two nodes."""
         try:
             self.outcome.later = await self._find_worse_path(
                 [await self._read_path(host, self._peer_of(host)) for host in self.join_order]
@@ -223,7 +223,7 @@ class Matrix:
             self.outcomes.append(await idle.measure_reconnection(IDLE, 1))
 
     async def _run_wave(self, pairs: Sequence[Pair], join_s: float, meet_s: float) -> list[Trial]:
-        """Run trials for all pairs at once."""
+        """Run trials for all pairs at the same time."""
         trials = [Trial(self._hosts, pair, next(self._numbers), self._rng) for pair in pairs]
         await asyncio.gather(*(trial.run(join_s, meet_s) for trial in trials))
         await asyncio.gather(*(trial.record_path() for trial in trials if not trial.outcome.trouble))
@@ -232,7 +232,7 @@ class Matrix:
         return trials
 
     async def _reset_mappings(self, trials: Sequence[Trial]) -> None:
-        """Cut the bootstrap node off; then reset the mappings, and change the external addresses; record recoveries."""
+        """Cut the bootstrap node off, then reset the mappings and change the external addresses; record recoveries."""
         met = [trial for trial in trials if None not in trial.outcome.took_s]
         self._net.cut(PUBLIC_HOST)
         direct = [trial for trial in met if trial.outcome.later == "direct"]

@@ -41,7 +41,7 @@ def make_matrix_rows(outcomes: Sequence[Outcome], part: str) -> list[list[str]]:
 
 
 def make_other_rows(outcomes: Sequence[Outcome]) -> list[list[str]]:
-    """Return the special cases: a row for each pair of each other part."""
+    """Return the rows of the special cases: in each part of the run without a matrix, a row for each pair."""
     found: list[list[str]] = []
     for part in dict.fromkeys(one.part for one in outcomes if one.part not in (*MATRIX_PARTS, ALONE)):
         some = [one for one in outcomes if one.part == part]

@@ -48,8 +48,8 @@ class Trial:
     """The result of one failure.
 
     ``takeover`` has the seconds from the failure until another robot moves, None if none moved; ``done`` whether the
-    task was completed, by ``by``; ``overlaps`` the number of samples in which two robots moved at once, ``zombies`` the
-    number of samples in which the failed robot moved after another had taken over.
+    task was completed, by ``by``; ``overlaps`` the number of samples in which two robots moved at the same time,
+    ``zombies`` the number of samples in which the failed robot moved after another had taken over.
     """
 
     cause: str
@@ -63,7 +63,7 @@ class Trial:
 
     @property
     def has_passed(self) -> bool:
-        """Whether another robot completed the task, and no two robots acted at once."""
+        """Whether another robot completed the task, and no two robots acted at the same time."""
         return self.done and self.by not in ("", self.lost) and self.takeover is not None and not self.violation_count
 
     @property
@@ -78,7 +78,7 @@ POLL_S = 0.01
 class TakeoverObserver:
     """Observer of a trial in which ``lost`` failed at ``began``; ``rng`` draws the duration of a freeze.
 
-    The trial ends ``limit`` seconds after the failure, or ``after`` seconds after its end was observed.
+    The trial ends ``limit`` seconds after the failure, or ``after`` seconds after the end of the task was observed.
     """
 
     def __init__(

@@ -2,7 +2,7 @@
 
 Needs Linux with ``unshare`` and ``ip``, without privileges: ``python -m benchmarks.takeover --real`` runs itself in a
 user and network namespace, in which this process is the router. The robots are attached to the router itself, so a node
-whose radio is lost keeps its robot.
+that loses its radio connection keeps its robot.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Lan:
         return ["nsenter", "--net", f"--target={self._holders[name].pid}", *arguments]
 
     def silence(self, name: str, one_way: bool = False) -> None:
-        """Drop all traffic from a node to the others, and unless ``one_way`` all traffic to it."""
+        """Drop all traffic from a node to the other nodes, and unless ``one_way`` all traffic to this node."""
         _run_ip("rule", "add", "iif", self._get_link_name(name), "blackhole", "priority", RULE)
         for other in self._numbers if not one_way else ():
             if other != name:

@@ -1,8 +1,9 @@
 """Codec of the AIBO's ports for walk, head, joints, emergency stop, world state and gains; pure.
 
-All numbers are little-endian, 32 bits wide.  The world state has two dialects, distinguished by their first bytes:
-``T4`` (Tekkotsu 4.0 and 5.x: model, counts of everything) and ``T2`` (2.x: no model, no frame number). The numbers of
-sensors are read from the stream, so the reader also accepts models other than the ERS-7.
+All numbers are little-endian, 32 bits wide.  The world state has two dialects, distinguished by their first bytes.
+``T4`` (Tekkotsu 4.0 and 5.x) contains the model of the robot and the number of values of each kind; ``T2`` (Tekkotsu
+2.x) contains neither the model nor a frame number. The reader takes the numbers of sensors from the stream, so it also
+accepts models other than the ERS-7.
 """
 
 from __future__ import annotations

@@ -410,5 +410,5 @@ def make_driver(
 
 
 def describe(options: Mapping[str, object], name: str) -> Description:
-    """Return the description of that dog."""
+    """Return the description of the dog that ``options`` select."""
     return make_description(parse_options(options))

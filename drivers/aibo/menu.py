@@ -140,7 +140,7 @@ def make_size_commands(width: int) -> list[str]:
 
 
 def make_rate_commands(fps: float) -> list[str]:
-    """Return commands for the frame rate; the dog waits after each picture, so half of its duration is subtracted."""
+    """Return commands that set the dog's wait after each picture: the frame interval minus half of ``PICTURE_MS``."""
     wait_ms = 0 if fps <= 0 or fps >= 29 else round(1000.0 / fps - PICTURE_MS / 2.0)
     return [format_setting("vision.rawcam.interval", wait_ms), format_setting("vision.rawcam_interval", wait_ms)]
 

@@ -112,7 +112,7 @@ class Odometry:
         self._newest = None
 
     def convert_time(self, t_ms: int) -> float:
-        """Convert a time stamp close to the newest one to seconds of the steady time."""
+        """Convert a time stamp, which must be close to the newest one, to seconds of the steady time."""
         if self._newest is None:
             return self.t
         return self.t + ((t_ms - self._newest + WRAP_MS // 2) % WRAP_MS - WRAP_MS // 2) / 1000.0

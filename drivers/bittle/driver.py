@@ -219,7 +219,7 @@ class BittleDriver(LinkedDriver):
         self._request_version()
 
     def link_down(self) -> None:
-        """Reset the motion here; the dog continues until it is reachable again; called by the link."""
+        """Reset the motion in this driver; the dog keeps its gait until it is reachable again. Called by the link."""
         self._link = None
         self._on_lost(LinkLost(f"the link to {self._name} was lost"))
 
@@ -386,5 +386,5 @@ def make_driver(
 
 
 def describe(options: Mapping[str, object], name: str) -> Description:
-    """Return the description of that dog."""
+    """Return the description of the dog that ``options`` select."""
     return make_description(parse_options(options))

@@ -69,7 +69,7 @@ class RequestTable:
             if place and pending.token == "k" and pending.command[1:].strip() == line.encode():
                 self._skip_to(place)
                 break
-        # Before it answers the rest command, the robot reports the gyroscope as off, with the gyroscope's token.
+        # Before the robot answers the rest command, it reports that the gyroscope is off, with the gyroscope's token.
         is_gyroscope_report = self._pending[0].token == "d" and is_end(line, "g")
         if not is_gyroscope_report:
             for place, pending in enumerate(self._pending):

@@ -1,1 +1,1 @@
-"""A camera of this machine or a substitute source of pictures: a device that sees and cannot move."""
+"""Cameras and substitute sources of pictures, as devices that see and cannot move."""

@@ -115,7 +115,7 @@ def make_driver(options: Mapping[str, object], name: str, clock: IReactorTime, c
 
 
 def describe(options: Mapping[str, object], name: str) -> Description:
-    """Return the description of that camera."""
+    """Return the description of the camera that ``options`` select."""
     return make_description(parse_options(options))
 
 

@@ -108,7 +108,7 @@ class SourceReader:
 
 
 class TimedStream:
-    """Pictures from files, timed by ``clock``: repeated runs deliver the same pictures."""
+    """Pictures from files, timed by ``clock``, so repeated runs deliver the same pictures."""
 
     def __init__(self, source: PictureSource, clock: IReactorTime) -> None:
         self._reader = SourceReader(source, self._report)

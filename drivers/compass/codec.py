@@ -77,7 +77,7 @@ class SentenceReader:
 
 
 def parse_heading(line: bytes) -> Heading | None:
-    """Parse one sentence; None if its kind has no heading; raise ``BadFrame`` if it is invalid or empty."""
+    """Return the heading in a sentence, None if its kind has no heading; raise ``BadFrame`` if invalid or empty."""
     body, star, checksum = line.strip().partition(b"*")
     if len(line) > MAX_LINE_BYTES or not body.startswith((b"$", b"!")) or not body.isascii():
         raise BadFrame("not an NMEA 0183 sentence")

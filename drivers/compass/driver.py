@@ -123,5 +123,5 @@ def make_driver(
 
 
 def describe(options: Mapping[str, object], name: str) -> Description:
-    """Return the description of that compass."""
+    """Return the description of the compass that ``options`` select."""
     return make_description(parse_options(options))

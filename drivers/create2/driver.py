@@ -69,7 +69,7 @@ class Create2Driver(LinkedDriver):
         self._counts |= {"safety_events": 0, "jumps": 0}
 
     def invoke(self, name: str, **arguments: float | str) -> Deferred[Mapping[str, Value]]:
-        """Run ``dock``: drive to the home base; or ``beep``: play ``hz``, from 49 to 12544, for ``s`` seconds."""
+        """Run ``dock`` (drive to the home base) or ``beep`` (play ``hz``, from 49 to 12544, for ``s`` seconds)."""
         if name not in SKILLS:
             return super().invoke(name, **arguments)
         if not self._is_up or self.state in ("stale", "closed"):
@@ -169,7 +169,7 @@ class Create2Driver(LinkedDriver):
         self._start()
 
     def link_down(self) -> None:
-        """Reset the motion; the robot itself keeps driving until it is reachable again; called by the link."""
+        """Reset the motion; the robot itself keeps driving until it is reachable again. Called by the link."""
         self._link = None
         self._timer.cancel()
         self._end_docking(LinkLost(f"the link to {self._name} was lost"))
@@ -262,5 +262,5 @@ def make_driver(
 
 
 def describe(options: Mapping[str, object], name: str) -> Description:
-    """Return the description of that robot."""
+    """Return the description of the robot that ``options`` select."""
     return make_description(parse_options(options))

@@ -55,5 +55,5 @@ def make_driver(options: Mapping[str, object], name: str, clock: IReactorTime, c
 
 
 def describe(options: Mapping[str, object], name: str) -> Description:
-    """Return the description of that phone."""
+    """Return the description of the phone that ``options`` describe."""
     return make_description(parse_options(options))

@@ -1,1 +1,1 @@
-"""Pyro compatibility: ``robot.move(0.5, 0)``, ``robot.range``, for Pyro brains of 2011, over any driver."""
+"""Pyro compatibility: run Pyro brains of 2011 (``robot.move(0.5, 0)``, ``robot.range``) over any driver."""

@@ -73,7 +73,7 @@ class Brain:
 
 
 class Engine:
-    """Runs one brain on ``robot``; ``init`` creates it from the engine, like ``INIT`` in a brain's file."""
+    """Runs one brain on ``robot``; ``init(engine)`` creates the brain, like ``INIT`` in a brain's file."""
 
     def __init__(self, robot: PyroRobot, clock: IReactorTime) -> None:
         self.robot = robot
@@ -82,7 +82,10 @@ class Engine:
         self._loop: LoopingCall | None = None
 
     def run(self, init: Callable[[Engine], Brain]) -> Deferred[None]:
-        """Create the brain and run its steps; fires when it quits, fails with its exception; then stop the robot."""
+        """Create the brain, run its steps, then stop the robot.
+
+        Fires when the brain quits; fails with the exception of the brain.
+        """
         self.robot.update()
         self.robot.localize()
         brain = self.brain = init(self)

@@ -345,5 +345,5 @@ def make_driver(
 
 
 def describe(options: Mapping[str, object], name: str) -> Description:
-    """Return the description of that robot."""
+    """Return the description of the robot that ``options`` select."""
     return make_description(parse_options(options))

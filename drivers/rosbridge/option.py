@@ -56,7 +56,7 @@ def _check_full(value: float) -> float:
 
 @dataclass(frozen=True)
 class Options:
-    """The robot; an empty topic means that the robot does not have it.
+    """The robot; an empty topic means that the robot lacks the device of this topic.
 
     With ``velocity_type`` "auto" the driver asks the robot (rosapi) for the type.  ``max_vx`` and ``max_vy`` are in
     m/s, ``max_wz`` in rad/s, ``radius`` in m.  ``scan_turn`` is the rotation of the scanner on the robot in degrees,

@@ -130,7 +130,7 @@ def make_driver(
 
 
 def describe(options: Mapping[str, object], name: str) -> Description:
-    """Return the description of that dog."""
+    """Return the description of the dog that ``options`` select."""
     return make_description(_parse_options(options, name))
 
 

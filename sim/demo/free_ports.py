@@ -75,7 +75,7 @@ def _bind(kind: Transport, host: str, port: int) -> socket.socket:
     opened = socket.socket(socket.AF_INET, socket.SOCK_STREAM if kind == "tcp" else socket.SOCK_DGRAM)
     try:
         if kind == "tcp":
-            # Twisted sets it on its listening ports too: a port in TIME_WAIT is free.
+            # As on the listening ports of Twisted, a port in TIME_WAIT counts as free.
             opened.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         opened.bind((host, port))
         if kind == "tcp":

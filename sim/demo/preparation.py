@@ -78,9 +78,9 @@ def make_plan(
 ) -> Plan:
     """Return a plan with free ports; report each usual port that is busy.
 
-    ``usual``: try the usual ports first, for interactive use; otherwise use arbitrary ports, so that several
-    demonstrations can start at the same time.  ``with_tls``: also serve the pages over TLS.  ``robot``: a key of
-    ``sim.demo.robots.ROBOT_SETS``.
+    With ``usual`` the usual ports are tried first, for interactive use; otherwise arbitrary ports are used, so that
+    several demonstrations can start at the same time. With ``with_tls`` the pages are also served over TLS. ``robot``
+    is a key of ``sim.demo.robots.ROBOT_SETS``.
     """
     try:
         free_ports.check_host("tcp", web_host)

@@ -63,8 +63,9 @@ MakeTeam = Callable[[int], DemoTeam]
 class Outcome:
     """The result of one trial; times are in seconds since the task was assigned, ``takeover`` since the kill.
 
-    ``found``: every dog reported before the task ended. ``agreed``: all agents selected the same dog. ``right``: the
-    nearest dog approached the target. ``held``: all conditions of the experiment are met.
+    ``found`` is whether every dog reported before the task ended, and ``agreed`` whether all agents selected the same
+    dog. ``right`` is whether the nearest dog approached the target, and ``held`` whether all conditions of the
+    experiment are met.
     """
 
     seed: int

@@ -1,6 +1,6 @@
 """Define kinds of NAT routers as rules for ``nft``.
 
-Terms of RFC 4787: a *mapping* is the external port of an internal socket; filtering* decides which external datagrams
+Terms of RFC 4787: a *mapping* is the external port of an internal socket; *filtering* decides which external datagrams
 may enter through this port.
 """
 

@@ -1,9 +1,9 @@
 """Switch the frames of the wide area between the sites in one process, with link impairments.
 
-``python -m sim.namespaces.switch SEED NAME=INTERFACE ..`` connects these interfaces of its namespace by raw sockets,
-so the kernel needs no traffic control. The process reads orders as JSON lines and echoes each order when it has taken
-effect; it ends with its input. A frame passes three simulated links: out of its site, between the two sites, and into
-the other site.
+``python -m sim.namespaces.switch SEED NAME=INTERFACE ..`` connects these interfaces of its namespace by raw sockets, so
+the kernel needs no traffic control. The process reads orders as JSON lines and echoes each order when it has taken
+effect; the process ends when its input ends. A frame passes three simulated links: out of its site, between the two
+sites, and into the other site.
 """
 
 from __future__ import annotations

@@ -34,7 +34,7 @@ def emulated_kinds() -> list[str]:
 class EmulatedRobots:
     """The emulated robots of ``table``, which maps names of dogs to settings of drivers.
 
-    Raises ``UsageError`` if the simulator does not have such a dog, or an emulator of such a robot.
+    Raises ``UsageError`` if the simulator does not have a dog of that name, or an emulator for that kind of robot.
     """
 
     def __init__(self, reactor: Any, rng: random.Random, simulator: RobotSimulator, table: Mapping[str, Table]) -> None:

@@ -1,7 +1,7 @@
 """A simulated world with a clock and with connections of drivers, for any kind of robots.
 
-Each robot obeys one driver at a time, through its own gate: a command expires after its time to live, even if the
-driver has ended, and the robot stops when the connection closes. The gate is kept when drivers change: over new
+Each robot obeys one driver at a time, through its own gate. A command expires after its time to live, even if the
+driver has ended; the robot also stops when the connection closes. The gate is kept when drivers change: over new
 connections it also refuses tokens lower than the highest obeyed token, which the robot reports to each driver.
 """
 

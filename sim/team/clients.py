@@ -1,6 +1,7 @@
 """Clients that write, remove and read slots at the nodes of a team, and record requests and answers.
 
-Clients do not check the results: the checker does, with the history (``sim.team.invariant.durability``).
+Clients do not check the results: the checker does, with the history (``sim.team.invariant.durability``). The words
+*place* and *life* are explained in ``sim.team.event``.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ T = TypeVar("T")
 def record_outcome(
     history: History, number: int, work: Deferred[T], shown: Callable[[T], object] = lambda result: None
 ) -> None:
-    """Record the outcome of ``work``, the request ``number``: ``shown(result)``, or the reason of its failure."""
+    """Record the result of the request ``number``, performed by ``work``, as ``shown(result)``, or its failure."""
 
     def failed(failure: Failure) -> None:
         failure.trap(EntangledError)
@@ -61,7 +62,7 @@ class Clients:
         concern: ConsistencyLevel = "majority",
         act: str = WRITE,
     ) -> None:
-        """Write the next number to a slot of the ``node`` at ``place``, or remove the slot (``act`` is ``REMOVE``)."""
+        """Write the next number to a slot of the ``node`` at ``place``; if ``act`` is ``REMOVE``, remove the slot."""
         slot = Slot(key, node.identity.public, name)
         self._write_counts[slot] += 1
         count = self._write_counts[slot]
@@ -72,7 +73,7 @@ class Clients:
     def read(
         self, place: int, life: int, node: EntangledNode, key: bytes, concern: ReadConsistency = "majority"
     ) -> Deferred[list[Record]]:
-        """Read at the ``node`` at ``place`` in its life ``life``; fires with the records, or with [] on failure."""
+        """Read at ``node``, which is the life ``life`` of ``place``; fires with the records, or with [] on failure."""
         # Each life is a separate client, because a restarted node may forget its own reads.
         number = self._record_request((place, life), READ, key, concern)
         return node.get(key, concern).addCallbacks(self._on_records, self._on_failure, (number,), {}, (number,))

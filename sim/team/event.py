@@ -45,7 +45,7 @@ class Answered(Event):
 class Unanswered(Event):
     """The client gave up: the operation may have been executed, or may still be executed.
 
-    ``is_unavailable``: the client got the error that too few replicas are available.
+    ``is_unavailable`` is whether the client got the error that too few replicas are available.
     """
 
     number: int
@@ -69,7 +69,7 @@ class Born(Event):
 
 @dataclass(frozen=True, slots=True)
 class Died(Event):
-    """A life ended: the node stopped; ``forgets``: the next node may lack stored data."""
+    """A life ended because the node stopped; with ``forgets``, the next node may lack stored data."""
 
     place: int
     forgets: bool = False
@@ -202,7 +202,7 @@ class OutcomeExpired(Event):
 
 @dataclass(frozen=True, slots=True)
 class OpenTask(Event):
-    """At the end of the run: an agent regards a task as open, and is in this state in the task."""
+    """At the end of the run an agent regards a task as open; ``state`` is the state of the agent in this task."""
 
     task: str
     place: int
@@ -292,7 +292,7 @@ class VoteAccepted(Event):
 
 @dataclass(frozen=True, slots=True)
 class LivingMembers(Event):
-    """The living council members, with their incarnations: a new incarnation has forgotten its votes."""
+    """The living council members, with their incarnations; a new incarnation has lost the votes of the member."""
 
     members: tuple[tuple[bytes, bytes], ...]
 

@@ -43,8 +43,8 @@ class Metric:
     """A measured ``value`` in ``unit``; None if nothing was measured.
 
     ``target`` is the target as text, or empty; ``holds`` is whether the target is met, None if there is no target.
-    ``n`` is the number of trials, 0 if the figure has no trials. ``is_exact``: the value follows from the seed, unlike
-    time and memory of the machine that runs the simulation.
+    ``n`` is the number of trials, 0 if the figure has no trials. ``is_exact`` is whether the value follows from the
+    seed, unlike time and memory of the machine that runs the simulation.
     """
 
     name: str

@@ -215,7 +215,7 @@ class Run:
             began = self._real_time()
             try:
                 clock.run_until(min(end, clock.seconds() + self._grain))
-            except Exception:  # a reactor would continue as well
+            except Exception:  # continue, as a reactor does
                 self._log.failure("a scheduled call of the team failed")
             self._is_ended = self._on_grain(self)
             elapsed = self._real_time() - began

@@ -30,8 +30,8 @@ class Schedule:
     """The run of ``seed``: nodes, network conditions and faults.
 
     ``workloads`` are created when the nodes exist. The first workload uses ``rng``, and each further workload has its
-    own generator, so that a seed that reveals a bug continues to do so. ``world`` creates the nodes; ``trim`` reduces
-    the run.
+    own generator, so that a seed that reveals a bug still reveals it when workloads are added. ``world`` creates the
+    nodes; ``trim`` reduces the run.
     """
 
     def __init__(self, seed: int, world: type[EntangledTeam] = EntangledTeam, trim: Reduction = NO_REDUCTION) -> None:
@@ -129,7 +129,7 @@ class Schedule:
         return faults
 
     def _draw_minority_faults(self, generator: random.Random) -> list[TimedFault]:
-        """Cut off a minority, which new nodes join until both together are a majority."""
+        """Cut off a minority; new nodes join this minority until they and it together are a majority."""
         few = generator.sample(range(self.n), (self.n - 1) // 2)
         newcomers = range(self.n, 2 * self.n - 2 * len(few) + 1)
         at = generator.uniform(2.0, self.seconds * 0.5)

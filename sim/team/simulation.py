@@ -156,7 +156,7 @@ class EntangledTeam(Simulation):
     def kill(self, place: int, forgets: bool = False) -> None:
         """Kill a node as by a loss of power; its store does not change.
 
-        ``forgets``: the next life may lack stored data.
+        With ``forgets``, the next life may lack stored data.
         """
         if place in self.living:
             self.end_life(place, forgets)

@@ -1,4 +1,4 @@
-"""Simulate nodes with stores in real SQLite files that lose power between any two instructions.
+"""Simulate nodes that have stores in real SQLite files and lose power between any two instructions.
 
 The writer has no thread: it commits at times of the simulated clock, so a run follows from its seed. A kill does not
 change the files, which may end with an incomplete commit; the next life of the node opens a copy.
@@ -150,8 +150,9 @@ class CheckedStore(SqliteStore):
 class SqliteTeam(EntangledTeam):
     """Nodes with stores in files of a temporary folder.
 
-    ``planned_corruption`` maps places to the kind of corruption ("row" or "file") at their next kill. ``lost`` lists
-    acknowledged writes that were missing after the restart, ``undetected`` corruptions that were not detected.
+    ``planned_corruption`` maps the place of a node to the kind of corruption ("row" or "file") of its store when the
+    node is next killed. ``lost`` lists acknowledged writes that were missing after the restart; ``undetected`` lists
+    corruptions that the node did not detect.
     """
 
     def __init__(self, n: int, seed: int = 1, conditions: LinkConditions = PERFECT) -> None:

@@ -17,7 +17,7 @@ class Workload:
     """
 
     def step(self) -> None:
-        """Act; called repeatedly while the faults last."""
+        """Make the next requests; called repeatedly while faults occur."""
 
     def make_final_requests(self) -> None:
         """Make the final requests, after the faults and the repair interval; answers are awaited for 10 s."""
@@ -38,7 +38,7 @@ class Workload:
 class WorkloadKind:
     """A kind of workload: ``settings`` is a frozen dataclass with constrained fields (``formats.convert``).
 
-    ``make(team, settings)`` creates one.
+    ``make(team, settings)`` creates a workload of this kind.
     """
 
     settings: type[Any]

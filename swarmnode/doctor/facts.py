@@ -29,10 +29,10 @@ class Answer:
 class Probe:
     """The result of probing one known node over UDP.
 
-    ``answer`` is its reply to a PROBE; ``is_member`` means that it also replied to a DISCOVERY of this team.
-    ``error`` is ``refused`` if the machine reported a closed port, ``unreachable`` if there is no route.  ``is_near``:
-    the node is in a subnet of this machine; ``is_resolved``: its hardware address was resolved.  ``is_tcp``: its
-    machine replies to TCP, even if only with a refusal.
+    ``answer`` is its reply to a PROBE; ``is_member`` means that it also replied to a DISCOVERY of this team. ``error``
+    is ``refused`` if the machine reported a closed port, ``unreachable`` if there is no route.  ``is_near`` is whether
+    the node is in a subnet of this machine, and ``is_resolved`` whether its hardware address was resolved. ``is_tcp``
+    is whether its machine replies to TCP, even if only with a refusal.
     """
 
     address: Address
@@ -60,7 +60,7 @@ class LanDiscovery:
 
 @dataclass(frozen=True)
 class Certificate:
-    """The dates of the node's certificate, as Unix timestamps; ``problem``: the reason why it cannot be read."""
+    """The dates of the node's certificate, as Unix timestamps; ``problem`` is the reason why it cannot be read."""
 
     not_before: float = 0.0
     not_after: float = float("inf")

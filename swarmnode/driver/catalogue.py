@@ -22,7 +22,10 @@ DEVICE_PATTERNS = ("/dev/ttyUSB*", "/dev/ttyACM*", "/dev/cu.usb*")
 
 @dataclass(frozen=True)
 class KindEntry:
-    """One kind of robot; ``is_ready``: nothing has to be installed; ``problem``: the reason why it cannot be loaded."""
+    """One kind of robot; ``is_ready`` is whether nothing has to be installed.
+
+    ``problem`` is the reason why the driver cannot be loaded.
+    """
 
     kind: str
     about: str

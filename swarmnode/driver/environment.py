@@ -28,7 +28,7 @@ class CommandEnvironment(Protocol):
         """The reactor, or a replacement for it."""
 
     def make_connector(self, is_moving: bool) -> tuple[Any, Callable[[], list[str]]]:
-        """Return the connector for a driver (None: the driver's default), and a function for the link problems."""
+        """Return the connector for a driver (None: the driver's default), and a function that lists link problems."""
 
     def open_terminal(self) -> Terminal:
         """Return the terminal; raises ``UsageError`` if there is none."""
@@ -48,7 +48,10 @@ class RealEnvironment:
         return reactor
 
     def make_connector(self, is_moving: bool) -> tuple[Any, Callable[[], list[str]]]:
-        """Return a connector that records problems, or None to drive: the default links supervise the robot's stop."""
+        """Return a connector that records problems; None if the robot will move.
+
+        Only the driver's default links ensure that the robot is stopped.
+        """
         if is_moving:
             return None, list
         from drivers.link import TcpConnector

@@ -56,7 +56,7 @@ class Monitor:
         self._ended: Deferred[int] = Deferred()
 
     def start(self) -> Deferred[int]:
-        """Begin; fires with the exit code when the robot is disconnected."""
+        """Begin; the Deferred fires with the exit code when the robot is disconnected."""
         self._driver.connect().addErrback(self._on_refused)
         if not self._is_over:
             self._on_time()

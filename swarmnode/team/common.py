@@ -82,7 +82,7 @@ class VerifiedTeam:
 def make_parser(
     prog: str, purpose: str, needs_key: bool = True, is_asked: bool = True, example: str = ""
 ) -> argparse.ArgumentParser:
-    """Return the parser of a verb with the common options; ``is_asked``: the verb sends requests to a node."""
+    """Return the parser of a verb with the common options; with ``is_asked`` the verb sends requests to a node."""
     epilog = f"Example: swarm {prog} {example}".rstrip()
     verb_parser = argparse.ArgumentParser(prog=f"swarm {prog}", description=purpose, epilog=epilog)
     if is_asked:
@@ -131,7 +131,7 @@ def get_key_folder() -> Path:
 
 
 def load_operator(named: Path | None) -> Operator:
-    """Load the operator's key in ``named``, by default the only one here; raises ``InvalidCommand``, ``BadKeyFile``."""
+    """Load the operator key from ``named`` (default: the only key); raises ``InvalidCommand`` or ``BadKeyFile``."""
     path = named or (Path(os.environ[OPERATOR_VARIABLE]) if os.environ.get(OPERATOR_VARIABLE) else None)
     if path is None:
         keys = sorted(get_key_folder().glob(f"*{KEY_FILE_SUFFIX}"))

@@ -121,7 +121,7 @@ def _join(
     text = format_settings(name, path.name, ["edge"], None, known, {**given, **own})
     is_kept = settings.exists() and settings.read_text(encoding="utf-8", errors="replace") != text
     write_settings(settings, text)
-    # The membership is written last: if it exists, the other files do.
+    # The membership is written last, so if it exists, the other files exist as well.
     memberships.create_membership_file(path, membership)
     seed_file.unlink(missing_ok=True)
     lines = [

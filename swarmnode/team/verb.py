@@ -1,6 +1,6 @@
 """Control socket requests about the team of a node; they accept signed statements, never a key.
 
-``devices`` lists all devices in a team of any size, as ``dht get devices`` does in a small one.
+``devices`` lists all devices in a team of any size, as ``dht get devices`` does in a small team.
 """
 
 from __future__ import annotations

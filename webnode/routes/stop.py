@@ -33,7 +33,7 @@ def release_team(request: RouteRequest) -> Any:
 
 
 def _summarize(devices: dict[str, str], otherwise: bool) -> Any:
-    """Summarize the confirmations; ``otherwise``: whether a team without robots is reported as stopped."""
+    """Summarize the confirmations; ``otherwise`` is whether a team without robots is reported as stopped."""
     robots = [each for each in devices.values() if each != NO_ROBOT]
     return {"halted": all(each == STANDS_STILL for each in robots) if robots else otherwise, "devices": devices}
 

@@ -66,7 +66,8 @@ class Readings:
         distance = bearing.copy()
         if target is not None:
             dx, dy = target.x - crowd.x, target.y - crowd.y
-            # A robot that hides the target from a robot in this set is nearer to the target, so it is also in this set.
+            # A robot that hides the target from a robot in this set is nearer to the target, so the hiding robot is
+            # also in this set.
             near = np.flatnonzero(dx * dx + dy * dy < SIGHT_M * SIGHT_M)
             dx, dy = dx[near], dy[near]
             far, towards = np.hypot(dx, dy), np.arctan2(dy, dx)
@@ -90,7 +91,7 @@ def stand(senses: Readings) -> Floats:
 
 
 def disperse(senses: Readings) -> Floats:
-    """Move away from everything that is near; stand if nothing is near."""
+    """Move away from all near objects; stand if nothing is near."""
     ranges = senses.ranges
     angle = np.arange(ranges.shape[1]) * (math.tau / ranges.shape[1])
     press = 1.0 - ranges / RAY_LENGTH_M

@@ -96,7 +96,7 @@ class Neighbours:
     """The pairs of bodies with centres within ``reach`` metres of each other.
 
     The search radius is larger by ``skin`` metres, so the list of pairs stays valid until a body has moved by half of
-    ``skin``: a search is needed only once in some dozens of steps.
+    ``skin``. A search is therefore needed only once in some dozens of steps.
     """
 
     def __init__(self, reach: float, skin: float) -> None:

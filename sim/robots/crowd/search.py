@@ -55,9 +55,9 @@ class SearchTeam(Protocol):
 class Outcome:
     """Results and cost of a search; times in virtual seconds since the task was assigned, cost in CPU seconds.
 
-    ``found`` is the number of agents that had found the target at the time of the agreement, or at the end; ``right``:
-    no agent among these was much nearer than the selected agent.  ``cost`` has the parts ``moving`` (robots, rays and
-    controllers), ``telling`` (sensor frames and pictures) and ``agents`` (nodes, drivers and agents).  ``trail`` is
+    ``found`` is the number of agents that had found the target at the time of the agreement, or at the end; ``right``
+    is whether none of these was much nearer than the selected agent.  ``cost`` has the parts ``moving`` (robots, rays
+    and controllers), ``telling`` (sensor frames and pictures) and ``agents`` (nodes, drivers and agents).  ``trail`` is
     the path of the selected robot.
     """
 

@@ -106,7 +106,7 @@ class AiboEmulator:
         return MemoryPorts(self._clock, self, delay)
 
     def accept(self, port: int, link: Link) -> Receiver:
-        """Accept a link to ``port``; close it at once if the port does not listen."""
+        """Accept a link to ``port``; close it immediately if the port does not listen."""
         service = self._find_service(port)
         client = _Client(self, service or "", FaultyOutput(self._clock, self._rng, self.faults, link), link)
         if service is None:
@@ -299,7 +299,7 @@ class _Client:
 
 
 class MemoryPorts:
-    """Opens links in memory to any port; with ``is_open`` False all are refused; ``cut`` breaks open links."""
+    """Opens links in memory to any port, or to none if ``is_open`` is False; ``cut`` breaks open links."""
 
     def __init__(self, clock: IReactorTime, dog: AiboEmulator, delay: float) -> None:
         self.is_open = True

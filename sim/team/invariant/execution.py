@@ -97,7 +97,7 @@ def e2(events: Iterable[Event]) -> Iterator[str]:
 
 
 def e3(events: Iterable[Event]) -> Iterator[str]:
-    """Takeover: after the failure of an agent only, a command with a higher token is accepted in time."""
+    """Takeover: if only an agent fails, a command with a higher token is accepted in time."""
     waited: list[CommandExpected] = []
     for event in events:
         if isinstance(event, CommandExpected):
@@ -138,7 +138,7 @@ def e5(events: Iterable[Event]) -> Iterator[str]:
 
 
 def e8(events: Iterable[Event]) -> Iterator[str]:
-    """No zombie: no agent sends a command under an expired lease, or acts on two tasks or holds two leases at once."""
+    """No zombie: no agent sends a command under an expired lease, or has two tasks or leases at the same time."""
     terms = Assumptions(0.0, 0.0, 0.0, 0.0, 0.0)
     for event in events:
         match event:

@@ -155,7 +155,7 @@ def t4(events: Iterable[Event]) -> Iterator[str]:
 
 
 def t5(events: Iterable[Event]) -> Iterator[str]:
-    """Returned claims: at the end no acknowledged tuple is held by a dead taker if its council can decide."""
+    """Returned claims: at the end no dead taker holds an acknowledged tuple whose council can decide."""
     space = _TupleSpaceState()
     putting: dict[int, Hashable] = {}
     acknowledged: set[Hashable] = set()

@@ -1,7 +1,7 @@
 """Run the auction of one task: its bidders, their decisions, and the holder of its lease.
 
-Bidders act like agents (``agents.engagement``) whose robots never move: the agent that wins by the announced bids
-claims the lease, the next two agents are standbys, and a holder that no longer wins releases the lease.
+Bidders act like agents (``agents.engagement``) whose robots never move. The agent that wins by the announced bids
+claims the lease, and the next two agents are standbys. A holder that no longer wins releases the lease.
 """
 
 from __future__ import annotations

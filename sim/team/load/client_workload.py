@@ -1,4 +1,4 @@
-"""Shared parts of workloads: the joined nodes of a team, a sorted list of node ids, and a pacer."""
+"""Shared parts of workloads: the joined nodes of a team, a sorted list of node ids, and a pacer for operations."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sim.team.workload import Workload
 
 
 class Pacer:
-    """A pacer: ``rate`` operations per second from the first ``take_due`` on; ``most`` in total (0: unlimited)."""
+    """Paces operations: ``rate`` per second after the first ``take_due``, at most ``most`` in total (0: unlimited)."""
 
     def __init__(self, clock: IReactorTime, rate: float, most: int = 0) -> None:
         self._clock = clock
@@ -93,7 +93,7 @@ class NodeIdIndex:
 
 
 class JoinedNodes:
-    """The joined nodes of a team, updated from before the first node joins."""
+    """The joined nodes of a team; has to be created before the first node joins."""
 
     def __init__(self, team: Team) -> None:
         self._team = team

@@ -1,8 +1,8 @@
 """Workload: random nodes look up other nodes; measures success, hops and time.
 
-As in the published studies used for comparison (Li et al., INFOCOM 2005), the target is the id of a random joined
-node, and a lookup succeeds if this node is the first of the result within the time limit. If the searching node or the
-target dies during the lookup, the trial is void.
+As in the published studies used for comparison (Li et al., INFOCOM 2005), the target is the id of a random joined node.
+A lookup succeeds if this node is the first of the result within the time limit. If the searching node or the target
+dies during the lookup, the trial is void.
 
 ``seconds`` are measured until the whole result (the k closest nodes) is available, ``reach_times`` until the target
 itself has answered, as in those studies.

@@ -1,6 +1,6 @@
-"""Workload: many simultaneous tasks; for each, a few agents that sense it bid (Assumption 1), and one holds the lease.
+"""Workload: many simultaneous tasks; the few agents that sense a task bid (Assumption 1), and one gets the lease.
 
-Each task has all phases: council, bids, announcement, claim.
+Each task passes through all phases: council, bids, announcement, claim.
 """
 
 from __future__ import annotations

@@ -171,7 +171,7 @@ class Values(ClientWorkload):
         return holders
 
     def _kill(self, value: Value) -> None:
-        """Kill as many of the nodes that acknowledged the value as the value must survive."""
+        """Kill nodes that acknowledged the value: as many as the value must survive."""
         held = self._find_holders(value)
         dying = self._rng.sample(held, min(value.acknowledged - 1, len(held) - 1)) if held else []
         for place in dying:

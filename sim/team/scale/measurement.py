@@ -1,8 +1,8 @@
 """Measure all figures of a team of one size, one after the other.
 
 Nodes adapt their timeouts to observed round-trip times, so the links of a team are not changed after its formation.
-Three teams are measured. Bare nodes on internet links give cost and lookups. Bare nodes on fast links, for which those
-targets are defined, give auctions and takeovers. Complete nodes give the directory, because bare nodes have no
+Three teams are measured. Bare nodes on internet links give cost and lookups. Bare nodes on fast links give auctions and
+takeovers, whose targets are defined for such links. Complete nodes give the directory, because bare nodes have no
 devices.
 """
 
@@ -139,7 +139,7 @@ class SizeMeasurement:
         team = Team(self._scenario, settings.seed)
         team.switchboard.link_model = RadioLink(LinkQuality(DELAY_S, JITTER_S, settings.loss))
         bidding = Auctions(team, AuctionSettings(count=settings.auctions, every=4.0))
-        # This rate limits the nodes that are away at the same time to a number that a small team tolerates.
+        # At this rate, no more nodes are away at the same time than a small team tolerates.
         rate = min(5.0, max(0.12, nodes / 200))
         dying = Takeovers(team, TakeoverSettings(count=settings.takeovers, rate=rate, away=AWAY_S))
         self._say("nodes join for a task")

@@ -56,7 +56,7 @@ def agreement(nodes: float) -> float:
 
 
 def busiest(nodes: float) -> float:
-    """Return the messages at the busiest node of the same simulation, without loss."""
+    """Return the messages at the busiest node in the simulation of ``agreement``, without loss."""
     return _interpolate(_BUSIEST, nodes)
 
 
