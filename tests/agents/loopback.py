@@ -11,7 +11,7 @@ from middleware.deployment import module_channel
 
 
 class Loopback:
-    """A conversation with a behaviour; replies arrive immediately, or on ``let`` if ``is_held`` is set."""
+    """A conversation with a behaviour; replies arrive immediately, unless ``is_held`` keeps them until ``let``."""
 
     def __init__(self, make: Factory, parameters: Mapping[str, Any] | None = None) -> None:
         self.fault = ""

@@ -66,7 +66,7 @@ class ExecutionTests(SynchronousTestCase):
         self.assertTrue(execution.has_stalled(62.2))
 
     def test_stall(self) -> None:
-        """An execution without progress for ``limit`` seconds has stalled, and stays stalled until the attempt ends."""
+        """An execution without progress for ``limit`` seconds has stalled, and remains so for the same time."""
         digger = Digger()
         execution = self.execution(digger, 2.0)
         for tenth in range(30):

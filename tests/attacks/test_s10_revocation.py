@@ -66,7 +66,7 @@ class TwentyTests(RevocationCase):
         self.assertEqual(self.refusals(self.bare(), self.others), {"revoked"})
 
     def test_after_a_cut(self) -> None:
-        """When a partition ends, the nodes behind it exclude the revoked member within ten seconds."""
+        """When a partition ends, the nodes that it had cut off exclude the revoked member within ten seconds."""
         near = self.team.houses[:12]
         far = self.team.houses[12:]
         self.team.switchboard.partition([self.team.address_of(each) for each in near])

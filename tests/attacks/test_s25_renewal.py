@@ -53,7 +53,7 @@ class RenewalCase(SiegeCase):
         return verify_certificate(self.team.signer.public, own.public, shown)
 
     def renew(self, shown: bytes, ago: float = 0.0, own: Identity = DOG, by: int = 1) -> bytes:
-        """Return ``shown``, renewed ``ago`` seconds ago by a bootstrap node, by default the hostile one."""
+        """Return the certificate ``shown`` as renewed ``ago`` seconds ago, by default by the hostile bootstrap node."""
         member, begin = self.read(shown, own), int(self.team.wall() - ago)
         return renew_certificate(self.keys[by], (self.honest, self.thief)[by], member, shown, begin)
 
@@ -122,7 +122,7 @@ class RevokedBootstrapTests(RenewalCase):
         self.assertEqual(self.said(self.renew(old, by=0)), "")
 
     def test_behind_a_void_renewal(self) -> None:
-        """A member with a valid grant and a void renewal of it is admitted by the grant, and is on the list."""
+        """A member with a valid grant and an invalid renewal of it is admitted by the grant, and is listed."""
         ghost = identity("ghost")
         old = wrap_grant(self.team.signer.grant(ghost.public, "ghost", ("viewer",), self.team.wall()))
         self.tell(self.team.signer.revoke(self.keys[1].public, "boot1", self.team.wall()))
@@ -151,7 +151,7 @@ class RevokedBootstrapTests(RenewalCase):
 
 class SelfRenewalTests(RenewalCase):
     def test_a_plain_member(self) -> None:
-        """A renewal that is signed by a member without the role bootstrap is invalid, for any key."""
+        """A renewal signed by a member without the role bootstrap is invalid, no matter whose key is renewed."""
         old = self.word(("device", "operator", "gateway"))
         grant = msgpack.unpackb(old)[1]
         self.team.days = 360
@@ -161,7 +161,7 @@ class SelfRenewalTests(RenewalCase):
         self.assertEqual(self.said(forged), FOREIGN)
 
     def test_a_bootstrap_node_beside_others(self) -> None:
-        """A bootstrap node with an expired renewal cannot renew itself while there is another bootstrap node."""
+        """A bootstrap node with an expired renewal cannot renew its own certificate if there is another such node."""
         old, own = wrap_grant(self.thief), self.keys[1]
         self.team.days = 300
         mine = [self.renew(old, ago, own) for ago in (0, 200 * DAY)]
@@ -286,7 +286,7 @@ class WideningTests(RenewalCase):
         return knocked
 
     def test_ahead_of_time(self) -> None:
-        """A renewal that starts in the future is not valid before its start, and not for longer than other renewals."""
+        """A renewal that starts in the future is invalid before its start, and ends no later than other renewals."""
         old = self.word()
         self.team.days = 300
         ahead = self.renew(old, -100 * DAY)
@@ -297,7 +297,10 @@ class WideningTests(RenewalCase):
 
 class RevivalTests(RenewalCase):
     def test_revoked_member(self) -> None:
-        """A revoked member stays rejected, for renewals by any node at any time, and no node offers it a renewal."""
+        """A revoked member stays rejected even with a renewal by any node of any time.
+
+        No node offers the revoked member a renewal.
+        """
         dog = self.team.enlist("dog")
         shown, own = dog.kept.membership.certificate, dog.kept.membership.identity
         before = self.renew(shown, own=own, by=0)
