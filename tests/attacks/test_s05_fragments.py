@@ -63,7 +63,7 @@ class FragmenterCase(SynchronousTestCase):
 
 class FragmentTests(FragmenterCase):
     def test_never_completed(self) -> None:
-        """Incomplete messages of one member take at most its share of the space, and are deleted after ten seconds."""
+        """Incomplete messages of a member take at most the member's share of the space, and are deleted after 10 s."""
         for number in range(2000):
             self.take(1, part(number, HALF, 0, bytes(FRAGMENT_BYTES)))
         self.assertLessEqual(self.bytes_in(), MAX_IN_PER_PEER_BYTES)

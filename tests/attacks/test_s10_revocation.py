@@ -98,7 +98,7 @@ class RevocationTests(RevocationCase):
         self.assertEqual(self.refusals(self.bare(2), self.others[:4]), {"revoked"})
 
     def test_a_copy_of_its_store(self) -> None:
-        """A copy of the member's store on another machine is rejected, with a lower or higher incarnation number."""
+        """A copy of the member's store on another machine is rejected, for a lower or higher incarnation number."""
         self.revoke()
         self.team.run(IN_FORCE)
         for number, incarnation in enumerate(

@@ -66,7 +66,7 @@ class Ether:
         clock.callLater(REPEAT, self._repeat)
 
     def reaches(self, one: int, other: int) -> bool:
-        """Return whether messages between the two places can arrive."""
+        """Return whether messages between the two nodes (given by their numbers) can arrive."""
         return self.side.get(one, 0) == self.side.get(other, 0)
 
     def send(self, source: int, target: int, deliver: Callable[[], None]) -> None:
@@ -128,7 +128,7 @@ class Ether:
             self.send(place, target, lambda target=target: self._member(target, place, task_id, member))  # type: ignore[misc]
 
     def results(self, place: int, task_id: str) -> list[Record]:
-        """Return the outcomes that the node at this place knows, as records."""
+        """Return the outcomes that the node with this number knows, as records."""
         known = self.replicas[place].results.get(task_id, {})
         return [
             Record(group_key(task_id), RESULT, bytes(32), 1, "team", 1.0, result.pack(), bytes(64))
@@ -136,7 +136,7 @@ class Ether:
         ]
 
     def outcome(self, place: int, task_id: str) -> Result | None:
-        """Return the outcome of a task that the node at this place knows."""
+        """Return the outcome of a task as the node with this number knows it."""
         known = self.replicas[place].results.get(task_id, {})
         return known[max(known)] if known else None
 

@@ -192,7 +192,7 @@ class Tasks:
         return not any(task_queue.open_ids or any(map(task_queue.is_new, self.tasks)) for task_queue in task_queues)
 
     def late(self) -> None:
-        """Let the record of each outcome expire although its task is still listed."""
+        """Let the record of each outcome expire although the task is still listed."""
         for name in self.tasks:
             if self.ether.outcome(OPERATOR, name) is not None:
                 self.history.record(OutcomeExpired, name)

@@ -154,7 +154,7 @@ class Wire(Workload):
         """Return a datagram for the node at ``own``: its kind, source and bytes."""
         rng, now = self._rng, self._schedule.team.clock.seconds()
         kind = rng.choice(KINDS)
-        if kind == "greeting":  # valid, but from an address that is not verified
+        if kind == "greeting":  # the datagram is valid, but its source address is not verified
             return kind, STRANGER, pack_discovery(derive_key(TEAM_KEY, b"greet"), rng.randbytes(TOKEN_BYTES), rng)
         source = rng.choice([STRANGER, None])
         place = own
