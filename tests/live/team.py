@@ -80,7 +80,7 @@ def dog(number: int, status: str, task: str, started: float) -> dict[str, Any]:
 
 
 def why() -> dict[str, Any]:
-    """Return two decisions: the one for dog3 is followed by the one for dog2, which dog3 has not received."""
+    """Return two decisions: first a decision for dog3, then a decision for dog2 that dog3 has not received."""
     costs = {"dog2": 0.62, "dog1": 1.04, "dog3": 1.37}
     reports = [{"agent": f"0{name[-1]}" * 16, "name": name, "cost": cost, "more": ""} for name, cost in costs.items()]
     first = {
@@ -181,7 +181,7 @@ class Team:
         return {**state, "halted": self.stop_control.is_halted()}
 
     def be_strange(self, words: list[str]) -> None:
-        """For each of ``words``, create a device, a task and a decision that have it in every text field."""
+        """For each text in ``words``, create a device, a task and a decision with this text in every text field."""
         now = time.time()
         self.batch += 1
         self.devices, self.tasks = [], []
@@ -283,7 +283,7 @@ class Orders(LineReceiver):
     _pages: list[Page]
 
     def lineReceived(self, line: bytes) -> None:
-        """Execute one command; reply to it, so the test knows when it has been executed."""
+        """Execute one command and reply, so the test knows when the command has been executed."""
         verb, *rest = line.decode().split()
         if verb == "team":
             self._begin(int(rest[0]))

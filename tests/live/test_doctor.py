@@ -72,7 +72,7 @@ class DoctorCase(NamespaceCase):
         return process
 
     def home(self, settings: Path) -> Path:
-        """Return the folder of a node's control socket; it depends on the host, because the hosts share one disk."""
+        """Return the folder of a node's control socket; each host has its own, because the hosts share one disk."""
         home = Path("/tmp") / f"doctor-{abs(hash((str(self.folder), settings.stem))) % 10**9}"
         if not home.exists():
             home.mkdir(mode=0o700)
@@ -137,7 +137,7 @@ class LanTests(DoctorCase):
         self.own = self.settings("own", net.address("a1"), [self.other])
 
     def test_well(self) -> None:
-        """Two nodes without known nodes find each other; the doctor finds no cause, and the link is good."""
+        """Two nodes with no known nodes in their settings find each other; the doctor finds no problem."""
         settings = self.settings("own", self.net.address("a1"))
         self.node("a1", settings)
         said = self.asked("a1", settings)

@@ -119,7 +119,7 @@ class FallbackTests(BrowserCase):
         self.assertEqual((len(keys), len(set(keys))), (2, 1))
 
     def test_keep_all_or_nothing(self) -> None:
-        """The page is cached as a whole: with a single cached file it would open without the other files."""
+        """The page is cached as a whole, because with a single cached file it would open without the other files."""
         self.opened()
         self.page.evaluate(KEPT)
         held = "async () => (await (await caches.open('swarm.shell')).keys()).length"

@@ -36,7 +36,7 @@ class ForkTests(SynchronousTestCase):
             run_in_fork(lambda: int("none"), ValueError)
 
     def test_ends_without_a_word(self) -> None:
-        """A child process that ends without a result raises an error that contains the exit code."""
+        """If a child process ends without a result, the call raises an error that contains the exit code."""
         with self.assertRaisesRegex(RuntimeError, "exit code 7"):
             run_in_fork(lambda: os._exit(7))
 

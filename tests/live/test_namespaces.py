@@ -49,7 +49,7 @@ class InternetTests(NamespaceCase):
     """Behaviour of ``Internet``."""
 
     def seen(self, net: Internet, host: str) -> list[tuple[str, int] | None]:
-        """Return the addresses at which three echo servers on the public host see one socket of ``host``."""
+        """Return the source addresses that three echo servers on the public host see for one socket of ``host``."""
         done = net.run(host, [sys.executable, "-c", ASK, *TARGETS], timeout=LIMIT_S)
         self.assertEqual(done.returncode, 0, done.stderr)
         found: list[tuple[str, int] | None] = json.loads(

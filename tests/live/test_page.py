@@ -104,7 +104,10 @@ class PageTests(PageCase):
         self.assertGreater(page.locator("canvas").first.bounding_box()["width"], 600)
 
     def test_ask_devices(self) -> None:
-        """The network is queried only while its view is shown, the storage of a device when its dialog opens."""
+        """The page queries the network only while the network view is shown.
+
+        It queries the storage of a device when the dialog of the device opens.
+        """
         page = self.opened(PHONE, has_clock=True)
 
         def asks() -> bool:
@@ -128,9 +131,9 @@ class PageTests(PageCase):
         self.assertFalse(asks())
 
     def test_tell_why(self) -> None:
-        """A task lists agents that agree and agents that differ.
+        """For each task the page lists the agents that agree on the decision and the agents that differ.
 
-        Its details show the rule and reports of each decision.
+        The details show the rule and the reports of each decision.
         """
         for screen in (PHONE, DESK):
             page = self.opened(screen)
@@ -153,7 +156,10 @@ class PageTests(PageCase):
             self.team.order("status dog1 WAITING")
 
     def test_show_cameras(self) -> None:
-        """A desktop shows three live cameras; the camera of an absent device, or out of view, is not requested."""
+        """A desktop shows three live cameras.
+
+        The pictures of a camera are not requested if its device is absent or if the camera is scrolled out of view.
+        """
         page = self.opened(DESK)
         page.locator("figure[data-camera=live]").nth(2).wait_for()
         self.team.order("gone dog2")
@@ -220,7 +226,10 @@ class PageTests(PageCase):
         self.assertEqual(self.faults, [])
 
     def test_run_the_parts_of_the_page(self) -> None:
-        """A panel appears at its place for its roles, gets events, and ends; rows with equal content are kept apart."""
+        """A panel is shown at its position to the permitted roles, receives events, and is removed.
+
+        Rows with equal content stay separate rows.
+        """
         page = self.informed(self.opened(DESK))
         self.assertEqual(page.evaluate(TWINS), [["abab", 4], ["aba", 0], ["baa", 0]])
         page.evaluate(PANELS)
@@ -238,7 +247,7 @@ class PageTests(PageCase):
         page.locator(".device[data-state=DONE]", has_text="dog3").wait_for()
 
     def test_tell_what_happened(self) -> None:
-        """Events are listed as text, newest first: all events, or only the events of one kind, device or task."""
+        """Events are listed as text, newest first; a filter selects the events of one kind, device or task."""
         page = self.opened(DESK)
         story = page.locator("#events li")
         page.locator("#events li", has_text="starts to observe").wait_for()

@@ -51,7 +51,7 @@ class SafetyTests(TeamCase):
         return self._key.sign_token(claim.ticket if ticket else claim)
 
     def asked(self, method: str, path: str, body: bytes | None = None, **headers: str) -> Answer:
-        """Send one request on a new connection; from a stream, read only the headers."""
+        """Send one request on a new connection and return the response; of a stream, read only the headers."""
         given = {name.replace("_", "-"): value for name, value in headers.items()}
         connection = http.client.HTTPConnection("127.0.0.1", self.team.port, timeout=10)
         try:

@@ -88,7 +88,10 @@ class UdpTests(TestCase):
 
     @inlineCallbacks
     def test_further_ports(self) -> Generator[Deferred[Any], Any, None]:
-        """A peer can be assigned to an additional port; an unknown sender gets its reply from the port that it used."""
+        """Datagrams to a peer can be sent from an additional port.
+
+        An unknown sender gets its reply from the port to which it sent.
+        """
         one, other = self.network(), self.network()
         heard: list[Address] = []
         arrived: Deferred[None] = Deferred()
