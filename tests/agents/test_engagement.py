@@ -209,7 +209,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.step().action, GO)
 
     def test_states_follow_the_thesis(self) -> None:
-        """A status is ASSIGNED, SEARCHING, WAITING after the report, EXECUTING with the lease, and finally DONE."""
+        """The status is ASSIGNED, then SEARCHING, WAITING after the report, EXECUTING with the lease, and DONE."""
         self.assertEqual(self.engagement.me.status, ASSIGNED)
         self.hear(self.report(2, None))
         self.assertEqual(self.step().action, LOOK)
@@ -434,7 +434,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual([(r.outcome, r.why) for r in self.results], [(FAILED, "past its deadline of 5 s")])
 
     def test_deadline_falls_to_one(self) -> None:
-        """An idle agent records the missed deadline only if no agent acts and its uuid is the lowest."""
+        """An idle agent records the missed deadline only if no agent acts and the idle agent has the lowest uuid."""
         self.begin(replace(TASK, deadline=5.0))
         self.clock.advance(5.1)
         lowest = min([ME, *self.others.values()], key=lambda one: one.node_id.hex())
@@ -446,7 +446,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(len(self.results), int(lowest is ME))
 
     def test_deadline_is_told_by_who_holds_the_task(self) -> None:
-        """An agent that ends a task on which no agent acts claims the lease first: the outcome needs its token."""
+        """An agent that ends a task on which no agent acts first claims the lease, whose token the outcome needs."""
         self.begin(replace(TASK, deadline=5.0))
         self.patch(self.engagement._decider, "is_first", lambda now: True)
         self.acting()
@@ -538,7 +538,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertGreater((self.reports[-1].epoch, self.reports[-1].serial), (4, 3))
 
     def test_heirs_hear_of_a_leave_from_the_one_that_leaves(self) -> None:
-        """An agent that leaves a task hands its standbys, in their order and without itself, to the lease client."""
+        """An agent that leaves a task passes the ordered list of standbys, without itself, to the lease client."""
         contacts = {n: Contact(each.public, Address("10.0.0.1", n)) for n, each in self.others.items()}
         self.outputs.known = {contact.node_id.hex(): contact for contact in contacts.values()}
         self.hear(self.report(2, 3.0), self.report(3, 2.0))

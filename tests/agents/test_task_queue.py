@@ -29,7 +29,7 @@ class TaskQueueTests(SynchronousTestCase):
         self.assertEqual(len(task_queue.list_followed()), MAX_FOLLOWED)
 
     def test_ended_task_never_starts_again(self) -> None:
-        """An ended task is not accepted again for a time: the longest lease plus the longest absence of a node."""
+        """After its end a task is not accepted again for the longest lease plus the longest absence of a node."""
         task_queue = TaskQueue()
         task_queue.add(OLD)
         task_queue.mark_over("old", 0.0)

@@ -81,7 +81,7 @@ class TwentyTests(RevocationCase):
 
 class RevocationTests(RevocationCase):
     def test_across_a_restart(self) -> None:
-        """A restarted node still rejects the member, even if it can contact no other node."""
+        """A restarted node still rejects the revoked member, even if the node can contact no other node."""
         self.revoke()
         self.team.run(IN_FORCE)
         self.team.close(self.bad, is_sudden=True)

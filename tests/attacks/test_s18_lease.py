@@ -1,4 +1,4 @@
-"""Attack S18: break, end, move or block the lease of another node, or use the name of another device."""
+"""Attack S18: take, end or block the lease of another node, or use the name of another device."""
 
 from __future__ import annotations
 
@@ -299,7 +299,7 @@ class NameTests(LeaseCase):
         self.assertEqual(self.names(listing.records), ["bad", "dog1", "dog2", "dog3", "dog4", "vaio"])
 
     def test_two_members_of_one_name(self) -> None:
-        """Two members with the same name are listed with a part of their ids after the name."""
+        """If two members have the same name, each is listed with a part of its id after the name."""
         self.team.enlist("dog2", "device")
         self.team.run(2.0)
         listing = self.outcome(self.team, self.team.nodes[0].list_devices(), 2.0)

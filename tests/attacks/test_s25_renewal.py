@@ -90,7 +90,10 @@ class RenewalCase(SiegeCase):
 
 class RevokedBootstrapTests(RenewalCase):
     def test_backdated(self) -> None:
-        """After a bootstrap node's revocation only its renewals that the operator kept are valid, for any dates."""
+        """After a bootstrap node's revocation only those of its renewals are valid that the operator kept.
+
+        The dates in the renewals have no influence.
+        """
         old = self.word()
         self.team.days = 300
         kept = self.renew(old)
@@ -139,7 +142,7 @@ class RevokedBootstrapTests(RenewalCase):
         self.assertEqual({self.said(self.renew(old, ago * DAY)) for ago in (0, 80, 360)}, {EXPIRED})
 
     def test_laundered_admission(self) -> None:
-        """A member that a revoked bootstrap node admitted is revoked, too, even if another node renewed it."""
+        """If a revoked bootstrap node admitted a member, the member is revoked even if another node renewed it."""
         shown = self.let_in(parse_code(self.team.invite("pup")), "pup")
         self.team.days = 300
         shown = self.renew(shown, by=0)
@@ -313,7 +316,7 @@ class RevivalTests(RenewalCase):
         self.assertNotIn(own.public, [each.public for each in due])
 
     def test_temporary_guest(self) -> None:
-        """A bootstrap node cannot renew a member that was granted or invited for less than a year."""
+        """A bootstrap node cannot renew a member whose grant or invitation is valid for less than a year."""
         short = self.word(life=DEFAULT_LIFE_S - 1)
         code, packed, terms = self.team.signer.invite(
             "pup", ("device",), 1, self.team.wall(), 3600.0, self.team.dice, life=float(DAY)

@@ -242,7 +242,10 @@ class RequestTableTests(SynchronousTestCase):
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def test_a_command_too_long_has_failed(self) -> None:
-        """A command that exceeds the robot's buffer fails, even if its token follows; the next request succeeds."""
+        """A command that exceeds the robot's buffer fails, even if the robot then sends the end token.
+
+        The next request succeeds.
+        """
         long, next_one = self.dialogue.request(b"i8 10 9 10\n", 1.0), self.dialogue.request(b"j\n", 1.0)
         self.hear("OVF", "i", "=", "0", "5,", "j")
         self.failureResultOf(long, RobotError)

@@ -68,7 +68,7 @@ class MotionTests(_Lab):
     def test_shares_become_speeds(self) -> None:
         """A relative speed is scaled by the robot's limit, which differs between forward and backward.
 
-        Left is positive.
+        Positive turns and sideways motions are to the left.
         """
         self.pyro.move(0.5, 0.0)
         self.assertEqual(self.moved(), (0.08, 0.0, 0.0))

@@ -77,7 +77,7 @@ class Ether:
                 self.clock.callLater(self.conditions.delay * self.rng.uniform(0.2, 3.0), deliver)
 
     def everywhere(self, source: int, change: Callable[[int], None]) -> None:
-        """Apply a change at ``source`` immediately, and at each other node when the message arrives."""
+        """Apply a change at the node ``source`` immediately, and at every other node when its message arrives."""
         change(source)
         for target in range(len(self.replicas)):
             if target != source:

@@ -204,7 +204,7 @@ class Leases(LeaseTeam):
         self._heal()
 
     def _conclude(self, task_id: str) -> None:
-        """Let the executing agent complete the task, or cancel the task.
+        """Let the executing agent complete the task, or let the last node cancel the task.
 
         After the acknowledgement no robot may move.
         """

@@ -37,7 +37,7 @@ HEARD = 3.0
 
 
 class Tasks:
-    """One schedule of agents, tasks and faults, which ``seed`` determines."""
+    """One schedule of agents, tasks and faults; ``seed`` determines the whole schedule."""
 
     def __init__(self, seed: int, trim: Reduction = NO_REDUCTION) -> None:
         self.rng = random.Random(f"tasks/{seed}")

@@ -1,6 +1,6 @@
-"""The workload of the wire: injects datagrams that no correct node sends, and checks their effects (R1 to R4).
+"""The workload of the wire: injects datagrams that no correct node sends, and checks invariants R1 to R4.
 
-The datagrams are derived from delivered datagrams: repeated, changed, truncated, or sent to another node or to the
+The injected datagrams are delivered datagrams that are repeated, changed, truncated, or sent to another node or to the
 restarted node. The replies to injected datagrams are not delivered, so an injection changes only counters.
 """
 

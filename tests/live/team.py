@@ -4,10 +4,15 @@
 a new team, in which vaio and pi accept each other's sessions; the reply contains the port, the join code, and an
 operator's token and ticket. ``end`` closes the page of the team. The other commands change the team:
 
-``gone NAME``, ``back NAME``, ``status NAME STATUS``, ``name NAME``: the name of the node that serves the page, ``pages
-NODE=URL ...``: the web nodes, starting with this node, ``strange FILE``: devices and tasks with the texts of this JSON
-list, ``session SECONDS``: the duration of a session, ``place NAME KEY=NUMBER ...``: the position that a device reports,
-``outdoors``: no simulator, ``crowd COUNT``: this number of devices, three of them with cameras.
+- ``gone NAME`` and ``back NAME`` let a device leave and return.
+- ``status NAME STATUS`` changes the status of a device.
+- ``name NAME`` changes the name of the node that serves the page.
+- ``pages NODE=URL ...`` sets the web nodes, starting with this node.
+- ``strange FILE`` creates devices and tasks with the texts of the JSON list in the file.
+- ``session SECONDS`` sets the duration of a session.
+- ``place NAME KEY=NUMBER ...`` sets the position that a device reports.
+- ``outdoors`` removes the simulator.
+- ``crowd COUNT`` creates devices until there are ``COUNT``, three of them with cameras.
 
 The program ends at the end of its input.
 """

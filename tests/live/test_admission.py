@@ -1,4 +1,4 @@
-"""Tests of a closed team of real processes: a node creates it, a second one joins by code over UDP and leaves."""
+"""Tests of a closed team of real processes: a second node joins it by code over UDP and is later revoked."""
 
 from __future__ import annotations
 

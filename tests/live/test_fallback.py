@@ -78,7 +78,7 @@ class FallbackTests(BrowserCase):
         self.served("pi")
 
     def test_go_past_an_impostor(self) -> None:
-        """A listed web node that is not a gateway gets no requests and no token, and no URL contains a token."""
+        """A listed web node without the role gateway gets no requests and no token; no URL contains a token."""
         eve = Team()
         self.addCleanup(eve.end)
         eve.order("name eve")

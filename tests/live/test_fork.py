@@ -41,7 +41,7 @@ class ForkTests(SynchronousTestCase):
             run_in_fork(lambda: os._exit(7))
 
     def test_ended_with_who_waits_for_it(self) -> None:
-        """If the waiting parent is interrupted, the call is interrupted too, and its exception reaches the parent."""
+        """If the waiting parent is interrupted, the child is interrupted too, and its exception reaches the parent."""
         ready, told = os.pipe()
         self.addCleanup(os.close, ready)
         self.addCleanup(os.close, told)

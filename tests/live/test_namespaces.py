@@ -64,7 +64,7 @@ class InternetTests(NamespaceCase):
         self.assertEqual(process.stdout.readline(), "ready\n")
 
     def test_mappings_are_of_their_kind(self) -> None:
-        """Each kind of router maps a socket to one external port for all peers, to one per peer, or to none."""
+        """Depending on its kind, a router maps a socket to one port for all peers, to one port per peer, or to none."""
         kinds = list(NatKind)
         net = self.internet(*(Site(kind.value, kind) for kind in kinds))
         self.echo(net)

@@ -45,7 +45,10 @@ class PageTests(PageCase):
         return list(page.locator(".device b").all_inner_texts())
 
     def test_reach_each_view(self) -> None:
-        """On a phone at most two taps open any view, alone on the screen; keys, back and links open it as well."""
+        """On a phone at most two taps open any view, which then fills the screen.
+
+        Keys, the browser's back button and links open views as well.
+        """
         page = self.opened(PHONE)
         shown = "[...document.querySelectorAll('main section, footer')].filter(e => e.checkVisibility()).map(e => e.id)"
         for name, links in {
@@ -94,7 +97,7 @@ class PageTests(PageCase):
         self.assertEqual((page.evaluate(dark), page.locator("#theme").input_value()), (chosen, "dark"))
 
     def test_fill_a_wall(self) -> None:
-        """A large screen shows all views simultaneously, or one of them in full size."""
+        """A large screen shows all views simultaneously, or a single view in full size."""
         page = self.opened({"viewport": {"width": 2560, "height": 1440}})
         heights = page.evaluate("[...document.querySelectorAll('main section')].map(e => e.getBoundingClientRect())")
         self.assertEqual(len([box for box in heights if box["top"] < 1440]), 7)
@@ -179,7 +182,7 @@ class PageTests(PageCase):
         phone.locator("figure[data-camera=live]").first.wait_for()
 
     def test_show_who_left(self) -> None:
-        """A device that leaves stays at its place as gone, with the time since then, and returns automatically."""
+        """A device that leaves stays in the list, marked as gone since a time; it returns automatically."""
         page = self.opened(DESK)
         self.assertEqual(self.names(page), ["dog1", "dog2", "dog3"])
         self.team.order("gone dog1")
@@ -191,7 +194,10 @@ class PageTests(PageCase):
         page.locator(".device[data-state=WAITING]", has_text="dog1").wait_for()
 
     def test_open_a_device(self) -> None:
-        """A double click, Enter and its URL open a device, a single click does not; Escape, Close and back close it."""
+        """A double click, the key Enter or the URL of a device opens its dialog; a single click does not.
+
+        Escape, the button Close and the browser's back button close the dialog.
+        """
         page = self.opened(DESK)
         dialog = page.locator("dialog[open]")
         page.locator(".device").nth(1).click()
@@ -290,7 +296,7 @@ class PageTests(PageCase):
         self.assertEqual(len(set(shapes)), 3)
         self.team.order("status dog3 DONE")
         page.locator(".device[data-state=DONE]", has_text="done").wait_for()
-        # If the events fill the screen, the page is scrolled, not a list within it.
+        # If the events fill the screen, the user scrolls the page, not a list within the page.
         self.view(page, "events")
         page.locator("#events li", has_text="starts to observe").wait_for()
         inside = """events => {
