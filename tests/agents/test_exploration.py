@@ -164,7 +164,7 @@ class DetourTests(SynchronousTestCase):
         self.assertFalse(detour.is_active(took))
 
     def test_detour_that_nobody_walks_is_none(self) -> None:
-        """A detour that is not called expires after its timeout; ``cancel`` ends a detour at any time."""
+        """A detour with steps that are not requested expires after a timeout; ``cancel`` ends a detour at any time."""
         detour = Detour(MotionCapabilities())
         detour.start((0.0, 0.0, 0.0), 1.0, 0.0, has_touched=True)
         self.assertTrue(detour.is_active(1.0))

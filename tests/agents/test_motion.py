@@ -94,7 +94,7 @@ class LearningTests(SynchronousTestCase):
         )
 
     def test_faster_turn_than_asked_for_is_a_coarse_aim(self) -> None:
-        """The larger the smallest possible turn of a robot is, the coarser is its aim, up to a limit."""
+        """A robot aims more coarsely the faster its slowest possible turn is, up to a limit."""
         motion = MotionCapabilities(replace(WHEELS, rates={"camera": 5.0}))
         self.turned(motion, 0.1, 1.0)
         large = motion.facing_tolerance

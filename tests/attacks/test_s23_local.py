@@ -68,7 +68,7 @@ class ControlSocketTests(SynchronousTestCase):
             self.assertRaises(NoControl, use, "vaio")
 
     def test_folder_that_is_a_link(self) -> None:
-        """A symbolic link is rejected in place of the folder, even if its target is valid."""
+        """A symbolic link instead of the folder is rejected, even if the target of the link is valid."""
         other = self.runtime / "elsewhere"
         other.mkdir(mode=0o700)
         (other / "vaio.control").touch()

@@ -173,7 +173,7 @@ class SelfRenewalTests(RenewalCase):
         self.assertEqual({self.said(each, own) for each in mine}, {EXPIRED})
 
     def tell_renewal(self, place: int) -> None:
-        """Let the other bootstrap node renew the bootstrap node with index ``place``."""
+        """Let the other one of the two bootstrap nodes renew the bootstrap node with the index ``place``."""
         shown = wrap_grant((self.honest, self.thief)[place])
         public = self.keys[place].public
         again = self.renew(shown, own=self.keys[place], by=1 - place)

@@ -350,7 +350,7 @@ class KitTests(SynchronousTestCase):
         self.assertEqual([(rule, each.__name__) for rule, each in _pairs() if rule not in found[each.__name__]], [])
 
     def test_only_what_is_broken(self) -> None:
-        """A driver that violates one rule passes the other checks."""
+        """A driver that violates one rule passes the checks for all other rules."""
         for rule, driver in (("clips", Boastful), ("refuses", Credulous), ("leaves", Haunting), ("times", Backward)):
             self.assertEqual(list(find_violations(bench(driver))), [rule], driver.__name__)
 

@@ -90,7 +90,7 @@ class HaltTimerTests(SynchronousTestCase):
         self.assertIsNone(self.timer.get_timeout(20.0))
 
     def test_heeds_newer_words(self) -> None:
-        """A new deadline replaces the old one; a report that the robot is at rest removes it.
+        """A new deadline replaces the old deadline; ``disarm`` removes the deadline.
 
         Both end the repetition of a halt.
         """

@@ -1,8 +1,8 @@
 """The workload of leases: agents claim, keep, lose and return leases under all faults.
 
-It checks the invariants E1 to E3, E5, E8 and E9. It has its own small world, so a thousand schedules take two minutes:
-the classes of the protocol, simulated machines and a simulated link. The assignments are random, because leases must be
-exclusive for any assignment.
+The workload checks the invariants E1 to E3, E5, E8 and E9. Its world is small, so a thousand schedules take two
+minutes; it consists of the classes of the protocol, simulated machines and a simulated link. The assignments are
+random, because leases must be exclusive for any assignment.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ class Leases(LeaseTeam):
                 self.nodes[place] = self.start_life(place)
 
     def _verify_health(self, task_id: str) -> None:
-        """Without faults, let one agent after the other leave; check E3, the graceful leave and E5."""
+        """Without faults, let one agent after the other leave; check invariants E3 and E5, and the graceful leave."""
         if not self.has_stores:
             # A lease that no member remembers must end first, because the next lease may have the same token.
             self.clock.advance(self.ttl)
@@ -288,7 +288,7 @@ class Leases(LeaseTeam):
         self.recorder.record_reachability()
 
     def _clog(self, *places: int) -> None:
-        """Disconnect the nodes at these places, unless the phase without faults has begun."""
+        """Disconnect the nodes with these numbers, unless the phase without faults has begun."""
         if not self._is_well:
             self._part(places)
             self.recorder.record_reachability()

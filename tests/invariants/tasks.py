@@ -1,7 +1,7 @@
 """The workload of tasks: complete agents over a network in memory, with all their decisions and actions.
 
-It checks the invariants E4 to E7 and needs no team of nodes: ``python -m tests.invariants --only tasks`` runs it alone,
-in milliseconds per schedule.
+The workload checks the invariants E4 to E7 and needs no team of nodes. ``python -m tests.invariants --only tasks`` runs
+only this workload, in milliseconds per schedule.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ class Tasks:
         agent.startService()
 
     def death(self, place: int) -> None:
-        """End an agent without notifying the others."""
+        """End an agent without notifying the other agents."""
         self.history.record(Died, place)
         del self.ether.nodes[place]
         self.agents.pop(place).stopService()

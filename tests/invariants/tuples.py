@@ -113,7 +113,7 @@ class Tuples(Workload):
         return [p for p in self._witness.list_undecided() if p.fields in self._acknowledged and self._can_decide(p)]
 
     def _can_decide(self, stored_tuple: StoredTuple) -> bool:
-        """Return whether a majority of the council is online and has its state."""
+        """Return whether a majority of the council members is online and has kept its state."""
         acceptors = {
             node.identity.public: node.take_acceptor for node in map(self._schedule.node, self._schedule.alive())
         }
@@ -218,7 +218,7 @@ class Tuples(Workload):
         self._taking(self._spaces[place].get_many(JOB, 1000), place)
 
     def _fetch(self) -> None:
-        """Wait for each tuple separately, so a tuple that cannot be taken does not block the others."""
+        """Wait for each tuple separately, so a tuple that cannot be taken does not block the other tuples."""
         for posted in self._left():
             place = self._rng.choice(sorted(self._spaces))
             self._get(posted.fields, place, self._spaces[place])

@@ -96,7 +96,7 @@ class Puppeteer:
             )
 
     async def said(self, word: str, count: int = 1) -> list[str]:
-        """Wait until ``count`` lines start with this word; return the rest of the last of them."""
+        """Wait until ``count`` lines start with this word; return the last of these lines without the word."""
         found: list[list[str]] = []
 
         def is_said() -> bool:

@@ -200,7 +200,7 @@ class LanTests(DoctorCase):
         self.assertEqual(self.causes("a1", settings), ["version-skew"])
 
     def test_machine(self) -> None:
-        """A port in use, an impossible store and settings that others can read are reported together."""
+        """A port in use, an unusable store, and settings that other users can read are reported together."""
         settings = self.settings("taken", self.net.address("a2"), [], store="nowhere/a.sqlite", lan=False)
         settings.chmod(0o644)
         self.assertEqual(self.causes("a2", settings), ["port-in-use", "store-unwritable", "key-readable"])

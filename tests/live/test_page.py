@@ -182,7 +182,10 @@ class PageTests(PageCase):
         phone.locator("figure[data-camera=live]").first.wait_for()
 
     def test_show_who_left(self) -> None:
-        """A device that leaves stays in the list, marked as gone since a time; it returns automatically."""
+        """A device that leaves stays in the list and is marked as gone, with the time since it left.
+
+        When the device returns, the mark disappears automatically.
+        """
         page = self.opened(DESK)
         self.assertEqual(self.names(page), ["dog1", "dog2", "dog3"])
         self.team.order("gone dog1")

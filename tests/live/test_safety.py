@@ -68,7 +68,7 @@ class SafetyTests(TeamCase):
         return {"Authorization": f"Bearer {token}"} if token else {}
 
     def test_let_in_whom_the_table_says(self) -> None:
-        """Each route accepts tokens of the roles in its row of the table, and rejects all others with 401 or 403.
+        """Each route accepts tokens of the roles that the table permits, and rejects all other tokens with 401 or 403.
 
         Every response has all security headers and does not identify the server.
         """
