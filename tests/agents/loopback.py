@@ -11,7 +11,7 @@ from middleware.deployment import module_channel
 
 
 class Loopback:
-    """A conversation with a behaviour; replies arrive immediately, or on ``let`` if ``is_held`` is set."""
+    """A conversation with a behaviour; replies arrive immediately, unless ``is_held`` keeps them until ``let``."""
 
     def __init__(self, make: Factory, parameters: Mapping[str, Any] | None = None) -> None:
         self.fault = ""
@@ -39,7 +39,7 @@ class Loopback:
         try:
             content = self._kind.call(self._thing, method, carried)
             answer = module_channel.parse_reply(module_channel.pack([number, True, content])[4:])[1:]
-        except Exception as error:  # as the process of a deployed behaviour does
+        except Exception as error:  # the process of a deployed behaviour also replies with the error
             answer = False, f"{type(error).__name__}: {error}"
         self._held.append(lambda: take(*answer))
         if not self.is_held:

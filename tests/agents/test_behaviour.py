@@ -71,7 +71,7 @@ class BehaviourTests(SynchronousTestCase):
             self.assertIn("invalid parameters", self.refusal(task))
 
     def test_missing_vision_names_the_extra(self) -> None:
-        """Without OpenCV, a task that needs vision raises an error that contains the extra to install."""
+        """Without OpenCV, a task that needs vision is refused; the error names the optional dependency to install."""
         hidden = {n: sys.modules.pop(n) for n in list(sys.modules) if n in ("agents.search", "agents.vision", "cv2")}
         sys.modules["cv2"] = None  # type: ignore[assignment]
 

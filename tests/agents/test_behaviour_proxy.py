@@ -41,7 +41,7 @@ class Spin:
     hold = search
 
     def execute(self, context: Context) -> Action | None:
-        """Return an action in the last turn but one, None in the last turn; raise KeyError in all earlier turns."""
+        """Return an action in the second to last turn, None in the last turn; raise KeyError in all earlier turns."""
         self.turns -= 1
         return {1: GO, 0: None}[self.turns]
 
@@ -54,7 +54,7 @@ def guarded(spin: object) -> tuple[Any, Loopback]:
 
 class BehaviourProxyTests(SynchronousTestCase):
     def test_asks_while_it_behaves(self) -> None:
-        """Observations reach the behaviour, and its actions and its end (None) reach the agent, all unchanged."""
+        """Observations reach the behaviour unchanged; its actions and its end (None) reach the agent unchanged."""
         spin = Spin()
         behaviour, _ = guarded(spin)
         behaviour.look(SEEN, 0.5)
@@ -86,7 +86,7 @@ class BehaviourProxyTests(SynchronousTestCase):
         self.assertEqual(behaviour.search(1.1 + ACTION_TTL_S), GO)
 
     def test_action_of_another_lease_or_method(self) -> None:
-        """A reply to a call with a different token, or to a call of a different method, moves nothing."""
+        """The robot does not move on a late reply to a call with a different token or to a different method."""
         behaviour, connection = guarded(Spin(turns=2))
         self.assertEqual(behaviour.execute(Context(0.0, token=4)), GO)
         connection.is_held = True
@@ -131,9 +131,9 @@ class BehaviourProxyTests(SynchronousTestCase):
             self.assertEqual((behaviour.search(0.0), behaviour.has_failed), (STAND, True), answer)
 
     def test_what_it_may_have_beside(self) -> None:
-        """Optional attributes of a behaviour are passed on.
+        """The proxy passes on the optional attributes of a behaviour.
 
-        If an attribute is missing or raises, its default is used.
+        If an attribute is missing or raises an exception, the proxy returns the default value of the attribute.
         """
         spin = Spin()
         spin.value, spin.choice = (1.0,), "left"  # type: ignore[attr-defined]
@@ -146,7 +146,7 @@ class BehaviourProxyTests(SynchronousTestCase):
         self.assertEqual((behaviour.value, behaviour.choice), ((), ""))
 
     def test_means_follow(self) -> None:
-        """Changed motion capabilities reach the behaviour earlier than the next observation."""
+        """Changed motion capabilities reach the behaviour before the next observation does."""
         received: list[MotionCapabilities] = []
         spin = Spin()
         spin.embody = received.append  # type: ignore[attr-defined]

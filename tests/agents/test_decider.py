@@ -14,20 +14,20 @@ B = Member("b", "dog2", "WAITING", 2.0, "a", "d1", epoch=3, serial=1)
 
 class RoundCounterTests(SynchronousTestCase):
     def test_first_decision_opens_no_round(self) -> None:
-        """The first decision opens no round; nor does a change of the inputs of a decision that has not been made."""
+        """The first decision opens no round; before it, a change of the inputs opens no round either."""
         epoch = RoundCounter()
         for basis in (("a",), ("a", "b")):
             self.assertEqual(epoch.determine_round(basis, "", "", ()), 0)
         self.assertEqual(epoch.determine_round(("a", "b", 1), "a", "d1", ()), 0)
 
     def test_change_after_a_decision_opens_a_round(self) -> None:
-        """After a decision, each change of its inputs opens exactly one round."""
+        """After a decision, each change of the inputs of the decision opens exactly one new round."""
         epoch = RoundCounter()
         epoch.determine_round((1,), "a", "d1", ())
         self.assertEqual([epoch.determine_round((n,), "a", "d1", ()) for n in (1, 2, 2, 3)], [0, 1, 1, 2])
 
     def test_same_decision_joins_the_round_of_another(self) -> None:
-        """An agent whose decision equals a decision of another agent in a newer round joins that round."""
+        """If another agent made the same decision in a newer round, the agent joins the newer round."""
         epoch = RoundCounter()
         epoch.determine_round((1,), "a", "d0", ())
         epoch.advance(3)
@@ -67,7 +67,7 @@ class PeerReportsTests(SynchronousTestCase):
     def test_stale_report_is_no_bid(self) -> None:
         """A bid expires after its validity period minus its age on arrival.
 
-        A report with a newer serial number renews it.
+        A report with a newer serial number renews the bid.
         """
         peer_reports = PeerReports("a")
         bid = replace(B, valid_for=3.0, age=1.0)
@@ -79,9 +79,9 @@ class PeerReportsTests(SynchronousTestCase):
         self.assertEqual(self.costs(peer_reports, 12.3), {"b": 2.0})
 
     def test_own_report_comes_back(self) -> None:
-        """An agent does not count its own report from an earlier run as a member.
+        """An agent does not count its own report from before its restart as the report of a member.
 
-        It only continues the numbers in it.
+        The agent only continues the report's round and serial numbers.
         """
         peer_reports = PeerReports("b")
         peer_reports.update([B], 0.0)

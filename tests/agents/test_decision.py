@@ -50,7 +50,7 @@ class ReadingTests(SynchronousTestCase):
     def test_charged_one_is_preferred(self) -> None:
         """Of equally distant robots, the robot with more battery charge is assigned.
 
-        At equal charge, the one with fewer tasks.
+        At equal charge, the robot with fewer tasks is assigned.
         """
         low, full = replace(member("a", 5.0), battery=0.2), replace(member("b", 5.0), battery=0.9)
         self.assertEqual(by("capability_cost", low, full).assigned, "b")
@@ -113,7 +113,7 @@ class DecisionTests(SynchronousTestCase):
                 self.assertEqual(decision.assigned, "a", (cost, hysteresis))
 
     def test_two_acting_members_come_down_to_one(self) -> None:
-        """If two agents report that they act, all agents choose the cheaper one, or at equal cost the lower uuid."""
+        """If two agents report that they act, all agents choose the one with the lower cost, then the lower uuid."""
         self.assertEqual(decided(member("a", 1.02, EXECUTING), member("b", 1.0, EXECUTING)).assigned, "b")
         self.assertEqual(decided(member("b", 1.0, EXECUTING), member("a", 1.0, EXECUTING)).assigned, "a")
 
@@ -152,12 +152,12 @@ class ReportersTests(SynchronousTestCase):
     def panelled(self, since: float, has_word: bool, *members: Member) -> str | None:
         """Return the agent that is assigned according to these reports.
 
-        ``has_word``: the council has announced its bids.
+        ``has_word`` is true if the council has announced the bids that it received.
         """
         return decide(members, Nearest(), 0.1, 8.0, since, has_word).assigned
 
     def test_council_is_waited_for(self) -> None:
-        """Complete reports of the subset suffice only after the council's announcement, or after a timeout."""
+        """If all reporters have reported, the decision still waits for the council's announcement or a timeout."""
         reporters = member("a", 2.0), member("b", 1.0)
         self.assertIsNone(self.panelled(0.0, False, *reporters))
         self.assertIsNone(self.panelled(8.0 + ANNOUNCEMENT_TIMEOUT_S - 0.1, False, *reporters))

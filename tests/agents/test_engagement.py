@@ -86,7 +86,7 @@ class LeaseClientStub:
         return Lease("t1", self.token, self.deadline) if held else None
 
     def claim(self) -> None:
-        """Record that the agent wants the lease."""
+        """Record that the agent claims the lease."""
         self.is_wanted = True
 
     def learn(self, packed: bytes) -> None:
@@ -209,7 +209,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.step().action, GO)
 
     def test_states_follow_the_thesis(self) -> None:
-        """A status is ASSIGNED, SEARCHING, WAITING after the report, EXECUTING with the lease, and finally DONE."""
+        """The status is ASSIGNED, then SEARCHING, WAITING after the report, EXECUTING with the lease, and DONE."""
         self.assertEqual(self.engagement.me.status, ASSIGNED)
         self.hear(self.report(2, None))
         self.assertEqual(self.step().action, LOOK)
@@ -290,7 +290,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual({(member.cost, member.assigned) for member in again}, {(1.0, ME.node_id.hex())})
 
     def test_who_was_passed_over_is_let_again(self) -> None:
-        """A standby that got the lease returns the lease when the better agent sends its next report."""
+        """A standby that was granted the lease returns it when the agent that it replaced sends its next report."""
         better = self.report(2, 0.5)
         self.hear(better)
         self.see(1.0)
@@ -316,7 +316,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertTrue(self.lease_client.is_wanted)
 
     def test_council_changes_under_who_acts(self) -> None:
-        """At a safe point the agent stops, the council is replaced, and the agent continues with a new lease."""
+        """At a safe point the acting agent stops, the council is replaced, and the agent continues with a new lease."""
         self.acting()
         self.dog.is_safe = False
         self.engagement.schedule_council_change([CONTACT] * 3)
@@ -352,7 +352,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.engagement.me.cost, 1.9)
 
     def test_lost_body_may_still_move(self) -> None:
-        """An agent that cannot stop its robot returns the lease with the time for which the robot may move."""
+        """An agent that cannot stop its robot returns the lease and states for how long the robot may still move."""
         for leave in (lambda: self.engagement.on_robot_lost(), lambda: self.engagement.leave(self.clock.seconds())):
             self.setUp()
             self.acting()
@@ -395,7 +395,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.events, ["halted", "released"])
 
     def test_pause_and_resume(self) -> None:
-        """A pause stops the robot and returns the lease; after the resume the behaviour continues from its state."""
+        """On a pause the agent stops the robot and returns the lease; after the resume the behaviour continues."""
         self.acting()
         self.engagement.process_order(Order(PAUSE, "vaio", 1.0))
         self.assertIsNone(self.engagement.step(self.clock.seconds()))
@@ -434,7 +434,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual([(r.outcome, r.why) for r in self.results], [(FAILED, "past its deadline of 5 s")])
 
     def test_deadline_falls_to_one(self) -> None:
-        """An idle agent records the missed deadline only if no agent acts and its uuid is the lowest."""
+        """An idle agent records the missed deadline only if no agent acts and the idle agent has the lowest uuid."""
         self.begin(replace(TASK, deadline=5.0))
         self.clock.advance(5.1)
         lowest = min([ME, *self.others.values()], key=lambda one: one.node_id.hex())
@@ -446,7 +446,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(len(self.results), int(lowest is ME))
 
     def test_deadline_is_told_by_who_holds_the_task(self) -> None:
-        """An agent that ends a task on which no agent acts claims the lease first: the outcome needs its token."""
+        """An agent that ends a task on which no agent acts first claims the lease, whose token the outcome needs."""
         self.begin(replace(TASK, deadline=5.0))
         self.patch(self.engagement._decider, "is_first", lambda now: True)
         self.acting()
@@ -459,7 +459,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual([result.token for result in self.results], [6])
 
     def test_higher_token_reopens_the_task(self) -> None:
-        """If an agent learns of a higher token when it ends a task, it takes part in the task again."""
+        """If an agent that records an outcome learns of a higher token, it takes part in the task again."""
         self.dog.steps = 1
         self.acting()
         self.step()
@@ -520,7 +520,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(len(self.flushLoggedErrors(ZeroDivisionError)), 1)
 
     def test_outcome_absorbs_what_follows(self) -> None:
-        """After its end, no event starts a task again; of two outcomes, COMPLETED with a token takes precedence."""
+        """No event restarts an ended task; if two outcomes are known, COMPLETED with a token takes precedence."""
         self.end(CANCELLED, "vaio")
         self.hear(self.report(2, 2.0))
         self.see(1.0)
@@ -538,7 +538,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertGreater((self.reports[-1].epoch, self.reports[-1].serial), (4, 3))
 
     def test_heirs_hear_of_a_leave_from_the_one_that_leaves(self) -> None:
-        """An agent that leaves a task hands its standbys, in their order and without itself, to the lease client."""
+        """An agent that leaves a task passes the ordered list of standbys, without itself, to the lease client."""
         contacts = {n: Contact(each.public, Address("10.0.0.1", n)) for n, each in self.others.items()}
         self.outputs.known = {contact.node_id.hex(): contact for contact in contacts.values()}
         self.hear(self.report(2, 3.0), self.report(3, 2.0))
@@ -550,7 +550,11 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.lease_client.standbys, [contacts[3], contacts[2]])
 
     def test_each_decision_is_accounted_for_once(self) -> None:
-        """Record a new decision immediately, changed reports at most once per second, an unchanged decision never."""
+        """A new decision is recorded immediately.
+
+        A decision with changed reports is recorded at most once per second; an unchanged decision is not recorded
+        again.
+        """
         records = self.outputs.decision_records
         self.step()
         self.assertEqual(records, [])

@@ -57,7 +57,7 @@ class ExecutionTests(SynchronousTestCase):
         self.assertIsNone(self.execution(Digger(float("nan"))).step(0.0, 1, 1.0).progress)
 
     def test_who_is_kept_from_it_does_not_stall(self) -> None:
-        """Time in which a stopped team makes no calls does not count as time without progress."""
+        """Time between two steps, for example while the team is stopped, does not count as time without progress."""
         execution = self.execution(Digger(), 2.0)
         for moment in (0.0, 0.5, 1.0, 61.0, 61.5):
             execution.step(moment, 1, 99.0)
@@ -66,7 +66,7 @@ class ExecutionTests(SynchronousTestCase):
         self.assertTrue(execution.has_stalled(62.2))
 
     def test_stall(self) -> None:
-        """Without progress for ``limit`` seconds an execution has stalled, for the duration of the attempt."""
+        """An execution without progress for ``limit`` seconds has stalled, and remains so for the same time."""
         digger = Digger()
         execution = self.execution(digger, 2.0)
         for tenth in range(30):

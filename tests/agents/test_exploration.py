@@ -81,7 +81,7 @@ class ExplorationTests(SynchronousTestCase):
                 self.assertTrue(0.0 < x < 3.0 and 0.0 < y < 3.0, (seed, walker.pose))
 
     def test_leg_ends_and_the_robot_looks_around_again(self) -> None:
-        """After a leg of at most ``LEG_M`` metres the robot stops and turns."""
+        """After a straight walk (a leg) of at most ``LEG_M`` metres the robot stops and turns."""
         walker = Walker(1, side=50.0)
         while walker.live() == 0.0:
             pass
@@ -149,14 +149,14 @@ class DetourTests(SynchronousTestCase):
             self.assertGreater(side * y, 0.2)
 
     def test_leg_ends_before_the_next_thing(self) -> None:
-        """If an obstacle is close ahead, the robot omits the leg."""
+        """If an obstacle is close ahead, the robot omits the walk (leg) at the end of the detour."""
         detour = Detour(MotionCapabilities())
         detour.start((0.0, 0.0, 0.0), 1.0, 0.0, has_touched=False)
         poses, _ = self.gone(detour, ahead=0.2)
         self.assertEqual(poses[-1][:2], (0.0, 0.0))
 
     def test_who_is_stuck_gives_up(self) -> None:
-        """A robot that does not move ends the detour when each of the three phases has timed out."""
+        """If a robot cannot move, each of the three phases of its detour ends by timeout."""
         detour = Detour(MotionCapabilities())
         detour.start((0.0, 0.0, 0.0), 1.0, 0.0, has_touched=True)
         _, took = self.gone(detour, moves=False)
@@ -164,7 +164,7 @@ class DetourTests(SynchronousTestCase):
         self.assertFalse(detour.is_active(took))
 
     def test_detour_that_nobody_walks_is_none(self) -> None:
-        """A detour that is not called expires after its timeout; ``cancel`` ends a detour at any time."""
+        """A detour with steps that are not requested expires after a timeout; ``cancel`` ends a detour at any time."""
         detour = Detour(MotionCapabilities())
         detour.start((0.0, 0.0, 0.0), 1.0, 0.0, has_touched=True)
         self.assertTrue(detour.is_active(1.0))

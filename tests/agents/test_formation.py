@@ -1,4 +1,4 @@
-"""Tests of ``agents.formation``: the posts of robots that do not act, and the ways to them."""
+"""Tests of ``agents.formation``: robots that do not act move to evenly spaced waiting positions, their posts."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class PostTests(SynchronousTestCase):
     def test_sectors_share_the_circle(self) -> None:
         """Each of three robots searches a third of the circle.
 
-        When one leaves, each of the other two searches half of it.
+        When one robot leaves, each of the two remaining robots searches half of the circle.
         """
         self.assertEqual(assign_sector("b", {"a", "b", "c"}), (math.pi, math.tau / 3))
         self.assertEqual(assign_sector("b", {"a", "b"}), (math.remainder(1.5 * math.pi, math.tau), math.pi))
@@ -79,9 +79,9 @@ class FormationTests(SynchronousTestCase):
         self.others = [Member("b", "dog2", "WAITING", 1.0, angle=0.2), Member("c", "dog3", "WAITING", 1.0, angle=2.0)]
 
     def test_rests_until_somebody_leaves(self) -> None:
-        """The robots rest until a robot leaves.
+        """The robots get no posts until a robot leaves.
 
-        Then the remaining robots, and any that join later, get evenly spaced posts.
+        Then the remaining robots, and robots that join later, get evenly spaced posts.
         """
         self.assertEqual(self.formation.update_members(self.others), [])
         self.assertIsNone(self.formation.assign_post(self.me, self.others, None))
@@ -139,6 +139,6 @@ class PostPathTests(SynchronousTestCase):
             self.assertLess(abs(distance - 1.2), 0.1)
 
     def test_stops_before_what_is_in_the_way(self) -> None:
-        """The robot does not move if an obstacle is ahead, or if the target is too close."""
+        """The robot does not move towards its post if an obstacle is ahead or if the target is too close."""
         self.assertLess(apart(self.walk(1.2, 2.0, ahead=0.3)[0], 0.0), 0.05)
         self.assertLess(apart(self.walk(MIN_CIRCLING_RADIUS_M - 0.05, 2.0)[0], 0.0), 0.01)

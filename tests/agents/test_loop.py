@@ -47,7 +47,7 @@ class LoopTests(SynchronousTestCase):
         return [text for _, text in self.device(name)["messages"]]
 
     def test_age_of_a_picture(self) -> None:
-        """The age of a camera frame is the time in the robot plus the time since it arrived."""
+        """The age of a camera frame is the time that it spent in the robot plus the time since its arrival."""
         agent = self.team.services["dog1"].assembly.agent
         assert isinstance(agent, Agent)
         ages: list[float] = []
@@ -147,7 +147,7 @@ class LoopTests(SynchronousTestCase):
         self.assertEqual(self.team.state()["tasks"][0]["status"], "COMPLETED")
 
     def test_only_who_did_it_is_done(self) -> None:
-        """After the task only the assigned agent becomes DONE; the other agent becomes IDLE and is never DONE."""
+        """After the task the assigned agent becomes DONE; the other agent becomes IDLE without becoming DONE."""
         self.submit()
         ends: dict[str, list[str]] = {"dog1": [], "dog2": []}
         for name, statuses in ends.items():

@@ -54,13 +54,13 @@ class DescriptionTests(SynchronousTestCase):
         self.assertEqual(with_camera().lens, MotionCapabilities().lens)
 
     def test_slow_camera_slows_the_turn(self) -> None:
-        """At two frames per second the robot turns at most half a view between two frames, and accepts older frames."""
+        """At 2 frames per second the robot turns at most half its field of view per frame, and accepts older frames."""
         slow = MotionCapabilities(replace(WHEELS, rates={"camera": 2.0}))
         self.assertLess(slow.look_turn / 2.0, 0.51 * slow.lens[0])
         self.assertGreater(slow.fresh, 2 / 2.0)
 
     def test_broad_body_stops_earlier(self) -> None:
-        """The camera of a wide robot stops farther from the target."""
+        """A wide robot stops when its camera is farther from the target than the camera of a narrow robot."""
         self.assertAlmostEqual(MotionCapabilities(described("create2")).stop_distance, 0.174 - 0.10 + 0.08)
         middle = MotionCapabilities(replace(WHEELS, capabilities={"camera": {"ahead": 0.01}}, radius=0.3))
         self.assertAlmostEqual(middle.stop_distance, 0.3 - 0.01 + 0.08)
@@ -70,7 +70,7 @@ class MissingAxesTests(SynchronousTestCase):
     def test_rest_on_an_axis_that_is_not_there_is_left_out(self) -> None:
         """A zero velocity on an axis that the robot lacks is removed.
 
-        Other velocities remain, and the driver refuses them.
+        A nonzero velocity on such an axis is kept, so the driver refuses the action.
         """
         self.assertEqual(MotionCapabilities(WHEELS).remove_missing_axes(STAND), {"base.vx": 0.0, "base.wz": 0.0})
         self.assertEqual(MotionCapabilities().remove_missing_axes(STAND), STAND)
@@ -80,7 +80,7 @@ class MissingAxesTests(SynchronousTestCase):
 
 class LearningTests(SynchronousTestCase):
     def turned(self, motion: MotionCapabilities, wished: float, done: float) -> None:
-        """Request a turn on the spot, and record the different velocity that was executed."""
+        """Let the robot learn that it executed a turn on the spot with the velocity ``done`` instead of ``wished``."""
         motion.learn({"base.vx": 0.0, "base.wz": wished}, {"base.vx": 0.0, "base.wz": done})
 
     def test_who_does_what_it_is_told_learns_nothing(self) -> None:
@@ -94,7 +94,7 @@ class LearningTests(SynchronousTestCase):
         )
 
     def test_faster_turn_than_asked_for_is_a_coarse_aim(self) -> None:
-        """The larger the smallest possible turn of a robot is, the coarser is its aim, up to a limit."""
+        """A robot aims more coarsely the faster its slowest possible turn is, up to a limit."""
         motion = MotionCapabilities(replace(WHEELS, rates={"camera": 5.0}))
         self.turned(motion, 0.1, 1.0)
         large = motion.facing_tolerance

@@ -106,7 +106,7 @@ class CouncilMaintainerTests(SynchronousTestCase):
         self.assertEqual(len(self.moving()), 1)
 
     def test_nobody_to_follow(self) -> None:
-        """If no node can replace a dead member, the council stays as it is, and the acting agent is not interrupted."""
+        """If no node can replace a failed member, the council stays unchanged; the acting agent is not interrupted."""
         self.made(SimulatedTeam(4, 0.1, dogs=("dog1", "dog2")))
         self.given("vaio", "dog1", "dog2")
         self.run_for(3.0)

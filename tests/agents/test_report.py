@@ -48,7 +48,7 @@ class ReporterTests(SynchronousTestCase):
     def test_all_is_told_at_first(self) -> None:
         """The first report with a cost contains battery, load and the behaviour's values.
 
-        Later reports only the changes.
+        Later reports contain only the changes.
         """
         offer = {"value": (1.0, 2.0), "choice": "red", "weight": 3.0, "electorate": 9.0}
         self.assertEqual(self.news(), {"cost": 2.0, "available": True, "battery": 0.8, "load": 2, **offer})

@@ -45,7 +45,7 @@ class RobotTests(SynchronousTestCase):
         self.assertEqual(self.robot.asked, [{"base.vx": 0.1, "base.wz": 0.0}])
 
     def test_what_it_really_does_is_learned(self) -> None:
-        """A robot that turns faster than requested makes the aim of all its behaviours coarser."""
+        """If a robot turns faster than requested, all its behaviours aim more coarsely."""
         self.assertFalse(self.body.motion.is_coarse)
         self.do(wz=0.15)
         self.assertTrue(self.body.motion.is_coarse)

@@ -39,13 +39,13 @@ def with_gaits(gaits: dict[str, Velocity], seed: int) -> Roamer:
 
 class RobotKindTests(SynchronousTestCase):
     def arrived(self, robot: Roamer, limit: float = 60.0) -> None:
-        """Check that the robot stops close to the target, and bumped into nothing faster than at a slow walk."""
+        """Check that the robot stopped close to the target, and that each bump was at most as fast as a slow walk."""
         self.assertTrue(robot.reach(limit), "never done")
         self.assertLessEqual(robot.gap, 0.15)
         self.assertLessEqual(robot.hardest, max(WALK_SPEED_MPS, robot.motion.walk) + 0.01)
 
     def test_robots_that_feel_their_way_find_it_too(self) -> None:
-        """A robot without a ranger bumps into nothing faster than at a slow walk, and reaches the target."""
+        """A robot without a ranger reaches the target, and bumps into obstacles at most at the speed of a slow walk."""
         for kind in ("create2", "bittle"):
             with self.subTest(kind=kind):
                 robot = roamer(kind, 1)
@@ -57,7 +57,7 @@ class RobotKindTests(SynchronousTestCase):
                 self.arrived(robot)
 
     def test_robot_that_turns_in_jerks_does_not_swing_for_ever(self) -> None:
-        """A robot that can only turn at 1.2 rad/s aims coarsely: it reaches the target and reverses its turn rarely."""
+        """A robot that can turn only at 1.2 rad/s aims coarsely, so it reaches the target with few reversals."""
         for seed in (1, 2):
             with self.subTest(seed=seed):
                 robot = with_gaits(JERKS, seed)
@@ -94,7 +94,7 @@ class BumpTests(SynchronousTestCase):
         return robot
 
     def test_bump_into_the_target_is_an_arrival(self) -> None:
-        """A target smaller than the task states appears farther away than it is; bumping into it completes the task."""
+        """If the target is smaller than stated, it appears too far away; then a bump into it completes the task."""
         robot = roamer("create2", 1)
         robot.behaviour = SearchAndApproach({"target_radius": 0.16, "target_height": 0.44}, Random(4))
         robot.behaviour.embody(robot.motion)
@@ -121,7 +121,7 @@ class BumpTests(SynchronousTestCase):
         self.assertLessEqual(robot.gap, 0.15)
 
     def test_body_that_goes_nowhere_has_bumped(self) -> None:
-        """A robot without bumper and ranger backs off if its odometry does not change for two seconds of walking."""
+        """A robot without bumper and ranger backs off if it walks for two seconds and its odometry does not change."""
         robot = roamer("bittle", 1)
         robot.world.clear_target()
         behaviour, motion = robot.behaviour, robot.motion

@@ -78,7 +78,7 @@ class Walk:
 
 class SearchTests(SynchronousTestCase):
     def test_target_is_found_wherever_it_is(self) -> None:
-        """From any heading the dog finds the target, and its cost is within 8 % of the true distance."""
+        """From any heading the dog finds the target, and the reported cost is within 8 % of the true distance."""
         for heading in (0.0, 1.5, -2.5, 3.1):
             walk = Walk(heading=heading)
             walk.world.place_target(1.6, 1.5)
@@ -89,7 +89,7 @@ class SearchTests(SynchronousTestCase):
 
 class RangerTests(SynchronousTestCase):
     def measure_cost(self, replaced: dict[str, float]) -> float:
-        """Return the reported distance, as a ratio to the true one, of a target at 0.9 m with these ranger values."""
+        """Return the ratio of the reported to the true distance of a target at 0.9 m, with these ranger values."""
         walk = Walk()
         walk.world.place_target(0.4 + NOSE_M + 0.9, 1.2)
         walk.replaced = replaced
@@ -102,7 +102,7 @@ class RangerTests(SynchronousTestCase):
         self.assertLess(abs(self.measure_cost({"range.near": math.nan, "range.far": 0.86}) * 0.9 - 0.94), 0.02)
 
     def test_ranger_that_reads_something_else_is_not_believed(self) -> None:
-        """If another dog, a wall behind the target or a missing echo falsifies the range, the camera gives the cost."""
+        """If another dog, a wall behind the target or a missing echo falsifies the range, the camera is used."""
         for wrong in (0.2, 0.45, 1.4, math.nan):
             self.assertLess(abs(self.measure_cost({"range.near": math.nan, "range.far": wrong}) - 1), 0.08, wrong)
 

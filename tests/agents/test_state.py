@@ -28,7 +28,7 @@ DEADLINE = 100.0
 
 class TableTests(SynchronousTestCase):
     def test_each_pair_has_one_row(self) -> None:
-        """Each event has exactly one row in each state, and every row is needed."""
+        """The table has exactly one row for each event in each state, and no unused row."""
         named = [(state, row.event) for row in ROWS for state in row.states]
         self.assertEqual((len(named), set(TABLE)), (len(set(named)), set(product(State, Event))))
         for row in ROWS:
@@ -98,7 +98,7 @@ class Rig:
 
     @property
     def key(self) -> tuple[object, ...]:
-        """Return the part of the state from which the effect of an input follows."""
+        """Return the part of the state that determines the effect of an input."""
         one, client = self.engagement, self.lease_client
         held = (
             one.state_machine.state,
@@ -155,19 +155,19 @@ class Rig:
 
 
 def hear(rig: Rig, one: Engagement, now: float, *others: Member) -> None:
-    """The other agents report, or have left if there are no ``others``."""
+    """Deliver the reports of ``others``; if ``others`` is empty, the other agents have left."""
     rig.others = list(others)
     one.process_reports(rig.others, None, now)
 
 
 def take(rig: Rig, one: Engagement, now: float) -> None:
-    """The agent gives its robot to the task."""
+    """The agent lets the task control its robot."""
     if one.lease_client is None and not rig.has_left:
         one.take_robot(rig.client, one.task_lease.token)
 
 
 def lend(rig: Rig, one: Engagement, now: float) -> None:
-    """Another task of the group gets the robot, unless this task acts."""
+    """Another task of the group gets control of the robot, unless the agent acts on this task."""
     if not one.is_acting and one.can_yield_robot:
         one.set_robot_lent(True, now)
 

@@ -87,15 +87,15 @@ class TaskGroupTests(SynchronousTestCase):
         self.assertEqual(len({point.digest for point in shares}), 1)
 
     def test_more_tasks_than_agents(self) -> None:
-        """With more tasks than agents, one task waits; its reason says that all bidders have reached their capacity."""
+        """With more tasks than agents, one task is not assigned, because all bidders have reached their capacity."""
         found = self.decided({"t1": {"a": 1.0}, "t2": {"a": 2.0}})
         self.assertEqual((found["t1"].assigned, found["t2"].assigned), ("a", None))
         self.assertEqual(found["t2"].why, "all bidders have reached their capacity")
 
     def test_who_acts_counts_for_its_task_alone(self) -> None:
-        """An acting agent gets no other task of the group, even if it is the nearest agent.
+        """An agent that acts on a task gets no second task of the group, even if it is the nearest agent.
 
-        A free agent gets the task.
+        A free agent gets the second task.
         """
         costs: Costs = {"t1": {"a": 1.0, "b": 9.0}, "t2": {"a": 0.1, "b": 9.0}}
         self.assertEqual(self.assigned(costs, t1="a"), {"t1": "a", "t2": "b"})
@@ -104,7 +104,7 @@ class TaskGroupTests(SynchronousTestCase):
     def test_who_acts_keeps_it_within_the_hysteresis(self) -> None:
         """A free agent takes over a task only if its cost is lower by the hysteresis.
 
-        Otherwise it gets a different task.
+        Otherwise the free agent gets a different task.
         """
         for cost, given in ((0.95, "a"), (0.85, "b")):
             self.assertEqual(self.assigned({"t1": {"a": 1.0, "b": cost}}, t1="a"), {"t1": given})
@@ -161,14 +161,17 @@ class SelectParticipationTests(SynchronousTestCase):
         return SimpleNamespace(engagement=SimpleNamespace(me=me, is_acting=is_acting, can_yield_robot=is_free))
 
     def test_given_task_has_it(self) -> None:
-        """The robot works on its agent's assigned task, unless the agent acts on another or records its outcome."""
+        """The robot works on its agent's assigned task.
+
+        However, if the agent still acts on another task or records that task's outcome, the robot stays with that task.
+        """
         other, given = self.part(None), self.part(assigned="a")
         self.assertIs(select_participation([other, given], other), given)
         for holder in (self.part(is_acting=True), self.part(is_free=False)):
             self.assertIs(select_participation([given, holder], holder), holder)
 
     def test_else_what_it_cannot_tell_yet(self) -> None:
-        """Without an assigned task the robot measures a task of unknown cost, or else keeps its present task."""
+        """Without an assigned task the robot measures a task of unknown cost; if there is none, it keeps its task."""
         reported, unknown, also = self.part(), self.part(None), self.part(None, assigned="b")
         self.assertIs(select_participation([reported, unknown, also], reported), unknown)
         self.assertIs(select_participation([reported, unknown, also], also), also)

@@ -29,7 +29,7 @@ class TaskQueueTests(SynchronousTestCase):
         self.assertEqual(len(task_queue.list_followed()), MAX_FOLLOWED)
 
     def test_ended_task_never_starts_again(self) -> None:
-        """An ended task is not accepted again for the longest lease plus the longest absence of a node."""
+        """After its end a task is not accepted again for the longest lease plus the longest absence of a node."""
         task_queue = TaskQueue()
         task_queue.add(OLD)
         task_queue.mark_over("old", 0.0)
@@ -45,7 +45,10 @@ class TaskQueueTests(SynchronousTestCase):
 
 class SelectTaskTests(SynchronousTestCase):
     def test_who_gets_the_body(self) -> None:
-        """The first task in the queue gets the robot, unless the present task must not stop or acts at its priority."""
+        """The first task in the queue gets the robot.
+
+        However, the present task keeps the robot if it must not stop, or if it acts and has the same priority.
+        """
         every = [NEW, OLD, URGENT]
         self.assertIs(select_task(every, None, True), URGENT)
         self.assertIs(select_task(every, OLD, True), URGENT)

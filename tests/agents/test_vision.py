@@ -55,7 +55,7 @@ class VisionTests(SynchronousTestCase):
             self.assertLess(max(map(abs, errors)), 0.12, (distance, errors))
 
     def test_lens_is_reckoned_with(self) -> None:
-        """With half the field of view, the same frame gives about twice the distance and a smaller bearing."""
+        """If the lens has half the field of view, the same frame means twice the distance and a smaller bearing."""
         studio = Studio()
         studio.target(0.9, 0.2)
         picture = studio.camera.render_jpeg(studio.world.dogs["dog1"])

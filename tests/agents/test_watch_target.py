@@ -85,7 +85,7 @@ class PhoneTests(SynchronousTestCase):
         self.assertEqual(phone.behaviour.progress, 1.0)
 
     def test_what_others_did_in_between_does_not_count(self) -> None:
-        """With a new token the progress continues; time between the two tokens and long gaps do not count."""
+        """Under a new token the progress continues; long gaps and the time between the tokens do not count."""
         phone = Phone(seconds=10.0)
         phone.execute(0.5, 11, is_resumed=False)
         phone.now += 5.0

@@ -80,7 +80,7 @@ class Counts:
 
 
 def list_slots(owner: bytes) -> list[Slot]:
-    """Return every combination of the keys and slot names of the role table's namespaces, for ``owner``."""
+    """Return all combinations of a key and a slot name of the role table's namespaces, for ``owner``."""
     examples = [namespace.slot(owner) for namespace in NAMESPACES.values()]
     keys = dict.fromkeys(slot.key for slot in examples)
     names = dict.fromkeys([*(slot.name for slot in examples), "x"])
@@ -212,7 +212,7 @@ class Trial:
         return [node.entangled.contact for node in self.nodes.values()]
 
     def _state(self) -> dict[tuple[str, Any], object]:
-        """Return the state of the team that an insider must not change without the right to do so."""
+        """Return the part of the team's state that an insider may change only if its roles permit the change."""
         found: dict[tuple[str, Any], object] = {}
         for name, node in self.nodes.items():
             for record in node.store.records():

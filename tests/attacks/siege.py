@@ -19,7 +19,7 @@ SOURCE = Address("10.6.6.6", 666)
 
 
 class AnyAdmission(OpenAdmission):
-    """The admission check of an attacker, which accepts every peer and presents any certificate."""
+    """An attacker's admission check, which accepts every peer and presents any certificate."""
 
     def __init__(self, certificate: bytes, max_pass_bytes: int = 640, life: int = 1) -> None:
         self.own_pass = certificate

@@ -159,7 +159,7 @@ def _last(node: ast.AST) -> str:
 
 class TreeTests(SynchronousTestCase):
     def test_nothing_in_the_tree_runs_content(self) -> None:
-        """No module of a node evaluates or unpickles received content, uses it as a format string, or imports by it."""
+        """No module of a node evaluates, unpickles or imports received content, or uses it as a format string."""
         found = [fault for module, tree in trees() for fault in faults_of(module, tree)]
         self.assertEqual(found, [])
 

@@ -1,4 +1,4 @@
-"""Attack S2: act without the right: change others' records, use an expired certificate or the wrong role."""
+"""Attack S2: change records of other members, or act with an expired certificate or without the required role."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class MethodTests(SiegeCase):
 
 class RecordTests(SiegeCase):
     def test_every_kind_by_every_role(self) -> None:
-        """A record in a namespace that its owner's role forbids is not stored, and its sender gets the reason."""
+        """A record in a namespace in which its owner's role may not write is not stored; the sender gets the reason."""
         team = self.village()
         house = team.houses[0]
         kinds = set()

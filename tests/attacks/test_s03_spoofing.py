@@ -1,4 +1,4 @@
-"""Attack S3: datagrams with spoofed addresses, and answers from the wrong node, with guessed numbers or unsolicited."""
+"""Attack S3: send datagrams with spoofed addresses, and unsolicited, guessed or misdirected answers."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ class SpoofingTests(SynchronousTestCase):
         run_state_machine_as_test(Spoofing, settings=SEQUENCES)
 
     def test_the_machine_notices(self) -> None:
-        """The state machine fails if a node accepts one of these datagrams."""
+        """The test of random sequences fails if a node accepts one of these datagrams."""
         ground = Ground()
         self.addCleanup(ground.stop)
         before = ground.state()

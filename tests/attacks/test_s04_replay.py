@@ -70,12 +70,13 @@ class ReplayCase(SiegeCase):
             half = endpoint._half_open
             self.assertLessEqual(len(half._unconfirmed), MAX_UNCONFIRMED)
             self.assertLessEqual(len(half._responses), MAX_RESPONSES)
-            # A replayed INIT may open a session that is never confirmed. Such sessions are limited in number and send
-            # nothing.
+            # A replayed INIT may open a session that is never confirmed. The number of such sessions is limited, and no
+            # data is sent in them.
             for session in list(half._unconfirmed.values()):
                 half.forget(session)
             half.clear()
-            # A node takes a recording from before a restart for a copy of the sender and logs it, once for each member.
+            # When a recording from before a restart arrives, the node assumes a copy of the sender and logs this once
+            # per member.
             self.assertLessEqual(len(endpoint._log_limiter._logged), len(team.houses))
             timers = sorted(call.getTime() for call in team.clock.getDelayedCalls())
             noted, endpoint._log_limiter = endpoint._log_limiter, LogLimiter()

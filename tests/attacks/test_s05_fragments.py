@@ -1,4 +1,4 @@
-"""Attack S5: fragments that never form a message, overlap, claim huge sizes, or come from a thousand members."""
+"""Attack S5: send fragments that never form a message, overlap, claim huge sizes, or come from many members."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class FragmenterCase(SynchronousTestCase):
 
 class FragmentTests(FragmenterCase):
     def test_never_completed(self) -> None:
-        """Incomplete messages of one member take at most its share of the space, and are deleted after ten seconds."""
+        """Incomplete messages of a member take at most the member's share of the space, and are deleted after 10 s."""
         for number in range(2000):
             self.take(1, part(number, HALF, 0, bytes(FRAGMENT_BYTES)))
         self.assertLessEqual(self.bytes_in(), MAX_IN_PER_PEER_BYTES)
@@ -90,7 +90,7 @@ class FragmentTests(FragmenterCase):
         self.assertEqual(self.counters["malformed"], len(wrong) + 1)
 
     def test_overlapping(self) -> None:
-        """A message with overlapping fragments has its announced length, and is delivered once."""
+        """A message with overlapping fragments is delivered once, with the announced length."""
         size = 3 * FRAGMENT_BYTES
         for fill in (b"a", b"b", b"a"):
             for place in (0, 2):

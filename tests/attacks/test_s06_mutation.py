@@ -42,7 +42,7 @@ class MutationTests(SynchronousTestCase):
     @BOUNDED
     @given(st.integers(0, 255), st.binary(max_size=200))
     def test_any_paper(self, kind: int, data: bytes) -> None:
-        """Arbitrary bytes as a statement, certificate, join request or join reply cause no violation."""
+        """Arbitrary bytes in place of a statement, certificate, join request or join reply cause no violation."""
         paper.check(bytes([kind]) + data)
 
     def test_paper_is_quick(self) -> None:
@@ -57,7 +57,7 @@ class MutationTests(SynchronousTestCase):
             self.assertLess(time.thread_time() - began, SLOWEST_S)
 
     def test_the_targets_notice(self) -> None:
-        """Valid inputs are accepted, so a target that rejects everything would be detected."""
+        """The target ``paper`` accepts valid inputs, and reports an accepted input that it takes for a forgery."""
         for kind, each in paper.LAWFUL.items():
             for place, whole in enumerate(each):
                 paper.check(bytes([paper.KINDS.index(kind) + 4 * place]) + whole)

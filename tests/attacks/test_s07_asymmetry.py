@@ -123,7 +123,7 @@ class FloodTests(FloodCase):
         self.assertLess(MAX_HANDSHAKES_PER_S, MAX_COOKIE_HANDSHAKES_PER_S)
 
     def test_others_still_come_in(self) -> None:
-        """During a flood another member, which returns the cookie, opens a session with one additional round trip."""
+        """During a flood a member that returns the cookie can open a session; this takes one additional round trip."""
         made = self.handshakes()
         self.flood(made, 1)
         friend, _ = self.insider(self.team, "friend")
@@ -147,7 +147,7 @@ class FloodTests(FloodCase):
         self.assertLessEqual(len(self.lines), 20 + SECONDS)
 
     def test_knocks_of_who_knows_the_id(self) -> None:
-        """A join request with the id of a real invitation, but not decryptable, costs no signature check."""
+        """An undecryptable join request with the id of a real invitation costs no signature check."""
         code = self.team.invite("dog")
         [invite] = self.team.houses[0].team.membership_list.list_invitations()
         self.assertTrue(code)

@@ -31,7 +31,7 @@ VICTIM = Address("10.7.7.7", 77)
 
 class AmplificationTests(SiegeCase):
     def setUp(self) -> None:
-        """Create a team of eight, for long answers, and count the bytes that one node sends to each address."""
+        """Create a team of eight, so answers are long, and count the bytes that one node sends to each address."""
         super().setUp()
         self.team = self.village()
         for name in ("dog", "cat", "pig", "cow", "hen", "fox", "owl"):
@@ -152,7 +152,7 @@ class IntroductionTests(SiegeCase):
 
 class RelayTests(SiegeCase):
     def test_a_stranger_is_not_carried_for(self) -> None:
-        """A relay forwards a datagram only in a session; the same bytes outside of a session are dropped."""
+        """A relay forwards a datagram only if it receives it in a session, and drops the same bytes otherwise."""
         team = self.village()
         team.enlist("dog")
         network: Any = network_of(team.houses[0])
@@ -200,9 +200,9 @@ class RelayTests(SiegeCase):
         return Relay(session_of, send, clock, Counter()), clock, sent
 
     def test_quota_of_a_pair(self) -> None:
-        """A pair of peers gets a burst and then 64 kbit/s.
+        """A relay forwards a burst for a pair of peers, and then 64 kbit/s.
 
-        If only one peer sends, the relay stops after two minutes.
+        If only one of the two peers sends, the relay stops forwarding after two minutes.
         """
         relay, clock, sent = self.relay()
         session: Any = OneSession(b"a" * 32)
@@ -219,7 +219,7 @@ class RelayTests(SiegeCase):
         self.assertEqual(sent[0], before)
 
     def test_quota_of_all(self) -> None:
-        """All pairs together are limited to the rate ``ALL_RATE``, and their number to 256."""
+        """The total rate of all pairs is limited to ``ALL_RATE``, and the number of pairs to 256."""
         relay, clock, sent = self.relay()
         for _ in range(10):
             for number in range(400):
@@ -230,7 +230,7 @@ class RelayTests(SiegeCase):
         self.assertLessEqual(len(relay), MAX_PAIRS)
 
     def test_no_carrying_in_circles(self) -> None:
-        """A relay does not forward datagrams that were relayed before, are too long or empty, or are for the sender."""
+        """A relay does not forward datagrams that are relayed already, too long, empty, or addressed to the sender."""
         relay, _, sent = self.relay()
         session: Any = OneSession(b"a" * 32)
         far: Any = OneSession(b"c" * 32, relayed_address(b"d" * 20))

@@ -36,7 +36,7 @@ class OutsiderTests(SiegeCase):
         return {contact.public for node in nodes for contact in node.overlay.contacts()}
 
     def test_ten_thousand_around_a_key(self) -> None:
-        """Ten thousand invented identities near a key enter no table although a member returns them.
+        """Ten thousand invented identities near a key enter no table, although a member returns them in lookups.
 
         The key stays readable.
         """
@@ -142,7 +142,10 @@ class InsiderTests(FleetCase):
         return right / len(values)
 
     def test_thirty_of_a_hundred(self) -> None:
-        """With 10 % of the members lying all keys are read correctly, with 20 % 99 %, and with 30 % 95 %."""
+        """If 10 % of the members lie, all keys are read correctly.
+
+        If 20 % lie, at least 99 % of the keys are read correctly; if 30 % lie, at least 95 %.
+        """
         for share, least in ((0.10, 1.0), (0.20, 0.99), (0.30, 0.95)):
             self.assertGreaterEqual(self.share_read(share), least, share)
 

@@ -66,7 +66,7 @@ class TwentyTests(RevocationCase):
         self.assertEqual(self.refusals(self.bare(), self.others), {"revoked"})
 
     def test_after_a_cut(self) -> None:
-        """When a partition ends, the nodes behind it exclude the revoked member within ten seconds."""
+        """When a partition ends, the nodes that it had cut off exclude the revoked member within ten seconds."""
         near = self.team.houses[:12]
         far = self.team.houses[12:]
         self.team.switchboard.partition([self.team.address_of(each) for each in near])
@@ -81,7 +81,7 @@ class TwentyTests(RevocationCase):
 
 class RevocationTests(RevocationCase):
     def test_across_a_restart(self) -> None:
-        """A restarted node still rejects the member, even if it can contact no other node."""
+        """A restarted node still rejects the revoked member, even if the node can contact no other node."""
         self.revoke()
         self.team.run(IN_FORCE)
         self.team.close(self.bad, is_sudden=True)
@@ -98,7 +98,7 @@ class RevocationTests(RevocationCase):
         self.assertEqual(self.refusals(self.bare(2), self.others[:4]), {"revoked"})
 
     def test_a_copy_of_its_store(self) -> None:
-        """A copy of the member's store on another machine is rejected, with a lower or higher incarnation number."""
+        """A copy of the member's store on another machine is rejected, for a lower or higher incarnation number."""
         self.revoke()
         self.team.run(IN_FORCE)
         for number, incarnation in enumerate(

@@ -74,7 +74,7 @@ class EavesdroppingTests(SiegeCase):
         self.assertEqual(found(self.heard, needles), [])
 
     def test_the_ear_hears(self) -> None:
-        """The search works: it finds the only unencrypted value, the fingerprint of the team in a PROBE_REPLY."""
+        """The search works, because it finds the only unencrypted value: the team's fingerprint in a PROBE_REPLY."""
         self.outcome(self.team, self.dog.node.endpoint.probe(self.team.address(0)))
         heard = [datagram for _, datagram, _ in self.tape.heard]
         fingerprint = self.team.houses[0].team.admission.fingerprint

@@ -58,7 +58,7 @@ class FileTests(SiegeCase):
             load(path)
 
     def test_no_file_at_all(self) -> None:
-        """A folder, a dangling link and invalid content are rejected, and the error does not contain the content."""
+        """A folder, a dangling link and a file with invalid content are rejected; the error contains no content."""
         (self.folder / "dir").mkdir()
         (self.folder / "nowhere").symlink_to(self.folder / "gone")
         (self.folder / "rubbish").write_bytes(b'{"seed": "topsecretseed"')

@@ -1,4 +1,4 @@
-"""Attack S13: store records of owners without a certificate, of revoked owners, and more than an owner's share."""
+"""Attack S13: store records of uncertified or revoked owners, or more records than an owner's share permits."""
 
 from __future__ import annotations
 
@@ -226,7 +226,7 @@ class RevokedKeyTests(RecordCase):
             self.assertNotEqual(house.node.store.get_slot(release.slot), release)
 
     def test_what_it_signs_afterwards(self) -> None:
-        """Records that the member signs after its revocation are rejected, also from an accomplice's node."""
+        """Records that a member signs after its revocation are rejected, even if an accomplice's node sends them."""
         self.revoke()
         bad, _ = self.insider(self.team, "bad", DEVICE)
         for house in self.others:
@@ -299,7 +299,7 @@ class FloodTests(RecordCase):
 
 class GuestTests(RecordCase):
     def test_second_hand(self) -> None:
-        """A node that joined after a guest left accepts the guest's record, also after a restart."""
+        """A node that joins after a guest has left accepts the guest's record, also after the node has restarted."""
         team = self.team
         guest = team.move_in(team.houses[0].team.create_guest(bytes(range(32)), "phone"))
         team.run(5.0)

@@ -48,7 +48,7 @@ class BackdatingTests(SiegeCase):
         return own, issue_certificate(thief, self.grant, (self.packed, self.invite), came, f"dog-{seed}", begin)
 
     def enter(self, own: Identity, shown: bytes, port: int) -> str:
-        """Return the code with which the first node rejects the member, or "" if the node admits the member."""
+        """Return the code with which the first node rejects the member, or "" if that node admits the member."""
         secret = self.team.houses[0].kept.membership.secrets[0][1]
         endpoint = self.attacker(self.team, own, secret, shown, SOURCE._replace(port=port))
         return self.refusal(self.team, endpoint.ask, self.team.houses[0], 4.0)
@@ -70,7 +70,7 @@ class BackdatingTests(SiegeCase):
         self.assertNotIn("dog-2", self.team.members())
 
     def test_revoked_with_all(self) -> None:
-        """The revocation of a bootstrap node also revokes the members that it admitted, if the operator keeps none."""
+        """If the operator revokes a bootstrap node and keeps none of the members that it admitted, all are revoked."""
         own, shown = self.mint(1, int(self.team.wall()))
         self.enter(own, shown, 701)
         self.assertIn("dog-1", self.team.members())
@@ -111,7 +111,7 @@ class RoomTests(SiegeCase):
 
 class UnlistedTests(SiegeCase):
     def test_who_is_met_is_listed(self) -> None:
-        """A member with a grant that no list contains is on every list after its first session, and can be revoked."""
+        """A member with a grant that is on no membership list is added by its first session, and can be revoked."""
         team = self.village()
         team.enlist("cat")
         hidden, own = self.insider(team, "ghost", "viewer")
@@ -136,7 +136,7 @@ class UnlistedTests(SiegeCase):
 
 class GuestTests(SiegeCase):
     def test_guests_of_one_gateway_are_few(self) -> None:
-        """A node admits a limited number of guests of one gateway, and rejects further guests as unlisted."""
+        """A node admits a limited number of guests of one gateway, and rejects all further ones as ``unlisted``."""
         team = self.village()
         paper = team.paper("gate", "gateway")
         refused = []

@@ -77,7 +77,10 @@ class JoinTests(SiegeCase):
         self.assertEqual(membership.secrets[0][1], self.team.houses[0].kept.membership.secrets[0][1])
 
     def signer(self, identity: Identity, granted: Identity, role: str, terms: bytes = b"") -> Signer:
-        """Return a signer with the operator's grant for the key ``granted``, and with the real terms or ``terms``."""
+        """Return a signer with the key of ``identity`` and the operator's grant for the key of ``granted``.
+
+        The signer presents ``terms``, or the real terms if ``terms`` is empty.
+        """
         grant = self.team.signer.grant(granted.public, "eye", (role,), self.team.wall())
         return Signer(identity, grant, terms or self.terms)
 
@@ -97,14 +100,14 @@ class JoinTests(SiegeCase):
         return join_codec.make_reply(self.invitation, heard, given, Signer(boot, grant, terms), self.rng)
 
     def test_another_operator(self) -> None:
-        """A reply in the name of another operator is rejected if it contains that operator's terms."""
+        """A reply in the name of a false operator is rejected if it contains the terms of the false operator."""
         impostor = Operator("yard", b"i" * 32, {"presence_lease": 9.0})
         false = JoinCode(self.code.secret ^ 1, compute_fingerprint(impostor.public))
         terms = seal_terms(false, TermsContent(impostor.public, "yard", impostor.settings), self.rng)
         self.check_true_team(lambda datagram, heard: self.forge(heard, impostor, terms))
 
     def test_another_operator_with_the_true_terms(self) -> None:
-        """The real terms in a reply of another operator's bootstrap node do not help: they name the real operator."""
+        """The reply of a false operator is rejected even with the real terms, because they name the real operator."""
         impostor = Operator("yard", b"i" * 32)
         self.check_true_team(lambda datagram, heard: self.forge(heard, impostor, self.terms))
 
@@ -114,8 +117,8 @@ class JoinTests(SiegeCase):
         Only the secret of the code can seal the terms.
         """
         impostor = Operator("yard", b"i" * 32)
-        # A search for a key with the fingerprint in the code takes a minute; instead the code gets the fingerprint of
-        # the key.
+        # To find a key with the fingerprint in a given code takes a minute, so the test makes a code with the
+        # fingerprint of the false key.
         code = JoinCode(self.code.secret, compute_fingerprint(impostor.public))
         self.invitation = code.key.public
         false = JoinCode(self.code.secret ^ 1, code.fingerprint)
@@ -131,7 +134,7 @@ class JoinTests(SiegeCase):
         self.check_true_team(self.give(signer, self.eye.kept.membership.certificate))
 
     def test_a_grant_of_another_node(self) -> None:
-        """Knowing the terms, a bootstrap node's grant and the newcomer's certificate is not enough to sign a reply."""
+        """The terms, a bootstrap node's grant and the newcomer's certificate are not enough to sign a valid reply."""
         self.team.knock(self.code.text, seed=NEWCOMER.seed)
         self.team.run(8.0)
         admission = self.eye.team.membership_list.find_admission(NEWCOMER.public)
@@ -140,7 +143,7 @@ class JoinTests(SiegeCase):
         self.check_true_team(self.give(signer, admission.certificate))
 
     def test_terms_of_another_invitation(self) -> None:
-        """Terms that were sealed for another code cannot be opened with this code."""
+        """Terms that were sealed for one join code cannot be opened with a different code."""
         other = self.team.signer.invite("cat", ("device",), 1, self.team.wall(), 3600.0, random.Random(9))
         statement = open_statement(self.team.signer.public, other.terms)
         assert isinstance(statement, Terms)
@@ -149,7 +152,7 @@ class JoinTests(SiegeCase):
         self.check_true_team(self.give(signer, self.team.houses[0].kept.membership.certificate))
 
     def test_an_old_answer(self) -> None:
-        """A recorded reply of the real bootstrap node cannot be opened in a later attempt."""
+        """A recorded reply of the real bootstrap node cannot be opened in a later attempt to join."""
         boot = self.team.houses[0].team.identity
         old = JoinRequest(NEWCOMER.public, bindings.crypto_scalarmult_base(b"o" * 32), "", b"")
         answer = self.give(self.signer(boot, boot, "bootstrap"), self.team.houses[0].kept.membership.certificate)

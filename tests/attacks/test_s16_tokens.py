@@ -1,4 +1,4 @@
-"""Attack S16: become an operator of the page as a member, by tokens, invitations, TLS, failover or guessing."""
+"""Attack S16: a member tries to become an operator of the page by tokens, invitations, TLS, failover or guessing."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ class PageCase(SynchronousTestCase):
         self.tell(self.team.operator.revoke(web.node.entangled.identity.public, name, self.now()))
 
     def rotate(self) -> None:
-        """Give the members except pi and eve a new secret, which replaces the old one immediately."""
+        """Give all members except pi and eve a new secret that replaces the old secret immediately."""
         members = [self.webs[name].node.entangled.identity.public for name in ("vaio", "nuc")]
         self.tell(self.team.operator.rotate_secret(2, members, self.now(), 0.0, random.Random(2)))
 
@@ -179,7 +179,7 @@ class MintTests(PageCase):
         )
 
     def test_invite_beyond_oneself(self) -> None:
-        """A guest cannot invite another guest for longer than the guest's own invitation is valid."""
+        """A guest cannot invite another guest for longer than the inviting guest's own invitation is valid."""
         user = self.vaio.sessions.authenticate(self.token.text, self.now())
         invited = self.signed(
             self.vaio, self.vaio.sessions.issue_guest_token(user, "guest", "operator", self.now(), 3600.0).text
@@ -317,7 +317,7 @@ class LogTests(SynchronousTestCase):
 
 class RebindingTests(SynchronousTestCase):
     def test_rebind_a_local_name(self) -> None:
-        """A Host header with an unknown local name is rejected; the node's and the configured names are accepted."""
+        """A Host header with an unknown local name is rejected; the node's own and configured names are accepted."""
         services, state = Services(MemoryTeamControl(), OpenSessions()), format_state([], [], {}, node="vaio")
         client = create_app(lambda: state, services, hosts=("vaio", "vaio.local", "robots.lan")).test_client()
 

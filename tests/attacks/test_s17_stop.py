@@ -1,4 +1,4 @@
-"""Attack S17: release a stop, prevent later stops, or make a node forget a stop."""
+"""Attack S17: release a stop, prevent a later stop, or make a node forget a stop."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ class DisablingTests(StopCase):
         self.assertEqual(set(self.team.is_on().values()), {True})
 
     def test_releases_in_advance_disable_no_stop(self) -> None:
-        """Releases of invented ids, more than the table can contain, end no stop and prevent no later stop."""
+        """Releases of more invented ids than the table can contain neither end a stop nor prevent a later stop."""
         bare, own = self.insider(self.team, "thief", OPERATOR)
         self.stop(self.bob)
         dice = random.Random(1)
@@ -189,7 +189,7 @@ class RightsTests(StopCase):
         self.assertEqual(set(self.team.is_on().values()), {True})
 
     def test_a_revoked_operator_releases_nothing(self) -> None:
-        """A release that an operator signs after its own revocation has no effect, from any sender."""
+        """A release that an operator signs after its own revocation has no effect, no matter which node sends it."""
         self.stop(self.ann)
         [stop] = self.stops(self.dogs[0])
         own = self.bob.kept.membership.identity
@@ -323,7 +323,10 @@ class LossTests(StopCase):
         self.assertEqual(set(self.team.is_on().values()), {False})
 
     def test_a_stop_of_an_earlier_version_stands(self) -> None:
-        """A stop of an earlier version has to be released by its id; a release of an earlier version ends no stop."""
+        """A stop in the format of an earlier software version is in force, and has to be released by its id.
+
+        A release in that format ends no stop.
+        """
         own = self.bob.kept.membership.identity
         bare, _ = self.insider(self.team, "dog3", DEVICE)
         self.store(bare, self.record(own, [7, True, "bob"]))
@@ -334,7 +337,7 @@ class LossTests(StopCase):
         self.assertEqual(set(self.team.is_on().values()), {False})
 
     def test_more_senders_than_places(self) -> None:
-        """Stops of more senders than the table can contain are still in force, and each of them must be released."""
+        """If more senders stop a node than its table can contain, the robot stands still until all are released."""
         dog, dice = self.team.halt(self.dogs[0]), random.Random(1)
         for number in range(MAX_SENDERS + 40):
             peer = Contact(number.to_bytes(32, "big"), SOURCE)
@@ -348,9 +351,9 @@ class LossTests(StopCase):
 
 class SequenceTests(StopCase):
     def test_stop_holds_on_whole_nodes(self) -> None:
-        """A stop holds until its release.
+        """Each stop stays in force until its own release, in random sequences of events.
 
-        Meanwhile there are other stops and releases, partitions, restarts and messages of a viewer.
+        The events are stops, releases, partitions, restarts and messages of a viewer.
         """
         bare, own = self.insider(self.team, "eye", VIEWER)
         for seed in range(SEQUENCES):

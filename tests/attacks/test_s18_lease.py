@@ -1,4 +1,4 @@
-"""Attack S18: break, end, move or block the lease of another node, or use the name of another device."""
+"""Attack S18: take, end or block the lease of another node, or use the name of another device."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ class LeaseCase(SiegeCase):
 
 class ReconfigurationTests(LeaseCase):
     def test_forged_council(self) -> None:
-        """A council that one device invents is not installed, and no second node gets the lease from it."""
+        """A council that one device invents is not installed, and grants the lease to no second node."""
         holder = self.held_by(self.members()[0])
         others = [self.team.contact(self.team.houses[place]) for place in self.outsiders()]
         own = Contact(self.own.public, SOURCE)
@@ -196,7 +196,7 @@ class ClosingTests(LeaseCase):
         self.assertTrue(holder.is_over)
 
     def test_member_that_says_it_is_over(self) -> None:
-        """A client gets the lease although one member falsely replies that the task has ended."""
+        """A client gets the lease even if one council member falsely replies that the task has ended."""
         liar = self.members()[1]
         acceptor: Any = self.team.nodes[liar].council_manager.lease_service._acceptor
         for name in ("prepare", "lease"):
@@ -266,7 +266,7 @@ class TaskTests(LeaseCase):
         self.assertEqual(self.seen(), before)
 
     def test_task_concluded(self) -> None:
-        """Every node ignores a device's record that another device's task has ended."""
+        """Every node ignores a record of a device that falsely states that another device's task has ended."""
         heard: dict[int, Result | None] = {}
 
         def follow(place: int) -> Group:
@@ -299,7 +299,7 @@ class NameTests(LeaseCase):
         self.assertEqual(self.names(listing.records), ["bad", "dog1", "dog2", "dog3", "dog4", "vaio"])
 
     def test_two_members_of_one_name(self) -> None:
-        """Two members with the same name are listed with a part of their ids after the name."""
+        """If two members have the same name, each is listed with a part of its id after the name."""
         self.team.enlist("dog2", "device")
         self.team.run(2.0)
         listing = self.outcome(self.team, self.team.nodes[0].list_devices(), 2.0)

@@ -141,7 +141,7 @@ class RecordedQuestionTests(SiegeCase):
             self.team.run(0.1)
 
     def test_every_method(self) -> None:
-        """A recorded INIT with a request changes nothing and gets no more bytes than it has, for any method."""
+        """For any method, a recorded INIT with a request changes nothing, and its reply is not longer than the INIT."""
         methods = self.house.node.endpoint._dispatcher.methods
         self.assertLessEqual(set(METHODS), set(methods))
         answered = []
@@ -283,11 +283,14 @@ class RoundTripTests(EndpointCase):
         self.assertEqual(self.asked("zeros", 1000, changes=False), 2.0)
 
     def test_early_and_changing(self) -> None:
-        """A method that changes state cannot be exposed as early."""
+        """A method that changes state cannot be exposed as an early method, which may run before the session exists."""
         self.assertRaises(ValueError, self.b.expose, "bad", lambda peer: 1, changes=True, early=True)
 
     def test_early_and_slow(self) -> None:
-        """An early method that returns a Deferred without a result is cancelled, and runs again in the session."""
+        """If an early method, which may run before the session exists, has no immediate result, it is cancelled.
+
+        The method runs again in the session.
+        """
         cancelled: list[object] = []
         waiting: list[Deferred[int]] = []
 

@@ -53,7 +53,7 @@ def encoded(width: int, height: int, *options: int) -> bytes:
 
 
 def claiming(width: int, height: int, kind: bytes = b"\xff\xc0") -> bytes:
-    """Return a small picture whose header states a different size, and optionally a different coding."""
+    """Return a small picture with a header that states a different size, and optionally a different coding."""
     data = bytearray(encoded(8, 8))
     start = data.index(b"\xff\xc0")
     data[start : start + 2] = kind
@@ -102,7 +102,7 @@ class BombCase(SynchronousTestCase):
 
 class HeaderTests(BombCase):
     def test_no_bomb_is_decoded(self) -> None:
-        """Neither the detection nor student programs decode the bombs, which have at most half a megabyte each."""
+        """Neither target detection nor student programs decode the bombs, files of at most half a megabyte each."""
         pyro = PyroCamera(8, 8)
         pyro.addFilter(lambda camera: len(camera.data))
         for number, (name, bomb) in enumerate(BOMBS.items(), start=1):
@@ -167,9 +167,9 @@ class HeaderTests(BombCase):
             self.assertIsNotNone(taken)
 
     def test_real_pictures_are_decoded(self) -> None:
-        """Baseline and progressive pictures are searched.
+        """The target is found in baseline and in progressive pictures.
 
-        Large pictures are reduced to every second or fourth pixel.
+        Large pictures are decoded at half or a quarter of their width and height.
         """
         for width, height in ((208, 156), (1920, 1080), (MAX_SIDE_PX, MAX_SIDE_PX)):
             for is_progressive in (0, 1) if width < MAX_SIDE_PX else (0,):
@@ -180,7 +180,7 @@ class HeaderTests(BombCase):
         self.assertEqual(len(self.decoded), 5)
 
     def test_most_that_is_decoded(self) -> None:
-        """The limit applies to the number of pixels of all scans together."""
+        """The limit applies to the number of pixels in all scans of a progressive picture together."""
         most = MAX_DECODED_PX // 1024**2
         self.assertEqual(read_size(of_scans(1024, 1024, most)), (1024, 1024))
         self.assertIsNone(read_size(of_scans(1024, 1024, most + 1)))

@@ -62,7 +62,7 @@ DEEP = {
 
 class MessageTests(SynchronousTestCase):
     def peak(self, data: bytes) -> tuple[bool, int]:
-        """Return whether a message is accepted, and the peak memory for a rejected message."""
+        """Return whether a message is accepted, and the peak memory that a rejected message needed."""
         tracemalloc.start()
         try:
             decode_message(data)
@@ -177,9 +177,9 @@ class FloodTests(SynchronousTestCase):
                 self.link.receiver.data_received(data[start : start + READ])
 
     def test_flood_of_empty_frames(self) -> None:
-        """The driver processes about a thousand of a megabyte of empty frames.
+        """Of a megabyte of empty frames, the driver processes only about a thousand frames.
 
-        Then it disconnects, and reconnects later.
+        Then the driver disconnects, and reconnects later.
         """
         for opcode in (PING, PONG, CONTINUATION, TEXT):
             with self.subTest(opcode=opcode):
@@ -203,7 +203,7 @@ class FloodTests(SynchronousTestCase):
         self.assertLess(self.taken, 60 * MAX_FRAMES)
 
     def test_pongs_do_not_pile_up(self) -> None:
-        """Pings of a peer that reads nothing are not answered."""
+        """Pings of a peer that reads nothing are not answered, so no pongs accumulate."""
         sent: list[bytes] = []
         self.patch(self.link, "send", sent.append)
         self.link.is_busy = True

@@ -1,4 +1,4 @@
-"""Attack S22: run code on a node as an author that is not, or no longer, an operator of the team."""
+"""Attack S22: push code to a node as an author that is not an operator, or no longer one."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ class PushedCodeTests(SynchronousTestCase):
         self.assertEqual((dict(dog.deployed), CANARY in sys.modules), ({}, False))
 
     def test_gateway_does_not_push(self) -> None:
-        """A gateway may write in the namespaces of operators, but cannot run code, even if its key is listed."""
+        """A gateway may write in the namespaces of operators but cannot run code, even if the dog lists its key."""
         author = self.join("author", "gateway")
         dog = self.allow(author)
         self.assertNotEqual(self.push(author), 0)
@@ -124,7 +124,7 @@ class PushedCodeTests(SynchronousTestCase):
         self.assertEqual(self.shown(), "")
 
     def test_device_and_viewer_do_not_push(self) -> None:
-        """A device or a viewer cannot run code, even if its key is listed by mistake."""
+        """A device or a viewer cannot run code, even if the dog lists its key by mistake."""
         authors = [self.join("author", "device"), self.join("second", "viewer")]
         dog = self.allow(*authors)
         for author in authors:
@@ -156,7 +156,7 @@ class PushedCodeTests(SynchronousTestCase):
         self.assert_nothing_runs(dog)
 
     def test_another_operator_follows_a_revoked_one(self) -> None:
-        """A module of a revoked operator, of any version, does not block a module of the next operator."""
+        """A revoked operator's module does not block the next operator's module, whatever its version is."""
         author, second = self.join("author", "operator"), self.join("second", "operator")
         dog = self.allow(author, second)
         self.push(author)
@@ -193,7 +193,7 @@ class PushedCodeTests(SynchronousTestCase):
         self.assertEqual((self.pose(), dict(dog.deployed)), (before, {}))
 
     def test_author_and_digest_are_shown(self) -> None:
-        """The page shows the author's name and key, and the digest, of a running and of a rejected module."""
+        """For a running and for a rejected module, the page shows the author's name and key, and the digest."""
         author = self.join("author", "operator")
         dog = self.allow(author)
         self.push(author)

@@ -68,7 +68,7 @@ class ControlSocketTests(SynchronousTestCase):
             self.assertRaises(NoControl, use, "vaio")
 
     def test_folder_that_is_a_link(self) -> None:
-        """A symbolic link is rejected in place of the folder, even if its target is valid."""
+        """A symbolic link instead of the folder is rejected, even if the target of the link is valid."""
         other = self.runtime / "elsewhere"
         other.mkdir(mode=0o700)
         (other / "vaio.control").touch()
@@ -90,7 +90,7 @@ class ControlSocketTests(SynchronousTestCase):
         self.assertIn("accessible to other users", str(self.assertRaises(NoControl, list, send_request(path, {}))))
 
     def test_service_of_another_user(self) -> None:
-        """Root may connect to another user's service in a folder that root names, but not in the shared folder."""
+        """Root may connect to a service of another user if root names its folder, but not in the shared folder."""
         prepare_path("vaio")
         path = self.listening("vaio")
         for each in (find_folder(), path):

@@ -53,7 +53,7 @@ class RenewalCase(SiegeCase):
         return verify_certificate(self.team.signer.public, own.public, shown)
 
     def renew(self, shown: bytes, ago: float = 0.0, own: Identity = DOG, by: int = 1) -> bytes:
-        """Return ``shown``, renewed ``ago`` seconds ago by a bootstrap node, by default the hostile one."""
+        """Return the certificate ``shown`` as renewed ``ago`` seconds ago, by default by the hostile bootstrap node."""
         member, begin = self.read(shown, own), int(self.team.wall() - ago)
         return renew_certificate(self.keys[by], (self.honest, self.thief)[by], member, shown, begin)
 
@@ -90,7 +90,10 @@ class RenewalCase(SiegeCase):
 
 class RevokedBootstrapTests(RenewalCase):
     def test_backdated(self) -> None:
-        """After a bootstrap node's revocation only its renewals that the operator kept are valid, for any dates."""
+        """After a bootstrap node's revocation only those of its renewals are valid that the operator kept.
+
+        The dates in the renewals have no influence.
+        """
         old = self.word()
         self.team.days = 300
         kept = self.renew(old)
@@ -122,7 +125,7 @@ class RevokedBootstrapTests(RenewalCase):
         self.assertEqual(self.said(self.renew(old, by=0)), "")
 
     def test_behind_a_void_renewal(self) -> None:
-        """A member with a valid grant and a void renewal of it is admitted by the grant, and is on the list."""
+        """A member with a valid grant and an invalid renewal of it is admitted by the grant, and is listed."""
         ghost = identity("ghost")
         old = wrap_grant(self.team.signer.grant(ghost.public, "ghost", ("viewer",), self.team.wall()))
         self.tell(self.team.signer.revoke(self.keys[1].public, "boot1", self.team.wall()))
@@ -139,7 +142,7 @@ class RevokedBootstrapTests(RenewalCase):
         self.assertEqual({self.said(self.renew(old, ago * DAY)) for ago in (0, 80, 360)}, {EXPIRED})
 
     def test_laundered_admission(self) -> None:
-        """A member that a revoked bootstrap node admitted is revoked, too, even if another node renewed it."""
+        """If a revoked bootstrap node admitted a member, the member is revoked even if another node renewed it."""
         shown = self.let_in(parse_code(self.team.invite("pup")), "pup")
         self.team.days = 300
         shown = self.renew(shown, by=0)
@@ -151,7 +154,7 @@ class RevokedBootstrapTests(RenewalCase):
 
 class SelfRenewalTests(RenewalCase):
     def test_a_plain_member(self) -> None:
-        """A renewal that is signed by a member without the role bootstrap is invalid, for any key."""
+        """A renewal signed by a member without the role bootstrap is invalid, no matter whose key is renewed."""
         old = self.word(("device", "operator", "gateway"))
         grant = msgpack.unpackb(old)[1]
         self.team.days = 360
@@ -161,7 +164,7 @@ class SelfRenewalTests(RenewalCase):
         self.assertEqual(self.said(forged), FOREIGN)
 
     def test_a_bootstrap_node_beside_others(self) -> None:
-        """A bootstrap node with an expired renewal cannot renew itself while there is another bootstrap node."""
+        """A bootstrap node with an expired renewal cannot renew its own certificate if there is another such node."""
         old, own = wrap_grant(self.thief), self.keys[1]
         self.team.days = 300
         mine = [self.renew(old, ago, own) for ago in (0, 200 * DAY)]
@@ -170,7 +173,7 @@ class SelfRenewalTests(RenewalCase):
         self.assertEqual({self.said(each, own) for each in mine}, {EXPIRED})
 
     def tell_renewal(self, place: int) -> None:
-        """Let the other bootstrap node renew the bootstrap node with index ``place``."""
+        """Let the other one of the two bootstrap nodes renew the bootstrap node with the index ``place``."""
         shown = wrap_grant((self.honest, self.thief)[place])
         public = self.keys[place].public
         again = self.renew(shown, own=self.keys[place], by=1 - place)
@@ -286,7 +289,7 @@ class WideningTests(RenewalCase):
         return knocked
 
     def test_ahead_of_time(self) -> None:
-        """A renewal that starts in the future is not valid before its start, and not for longer than other renewals."""
+        """A renewal that starts in the future is invalid before its start, and ends no later than other renewals."""
         old = self.word()
         self.team.days = 300
         ahead = self.renew(old, -100 * DAY)
@@ -297,7 +300,10 @@ class WideningTests(RenewalCase):
 
 class RevivalTests(RenewalCase):
     def test_revoked_member(self) -> None:
-        """A revoked member stays rejected, for renewals by any node at any time, and no node offers it a renewal."""
+        """A revoked member stays rejected even with a renewal by any node of any time.
+
+        No node offers the revoked member a renewal.
+        """
         dog = self.team.enlist("dog")
         shown, own = dog.kept.membership.certificate, dog.kept.membership.identity
         before = self.renew(shown, own=own, by=0)
@@ -310,7 +316,7 @@ class RevivalTests(RenewalCase):
         self.assertNotIn(own.public, [each.public for each in due])
 
     def test_temporary_guest(self) -> None:
-        """A bootstrap node cannot renew a member that was granted or invited for less than a year."""
+        """A bootstrap node cannot renew a member whose grant or invitation is valid for less than a year."""
         short = self.word(life=DEFAULT_LIFE_S - 1)
         code, packed, terms = self.team.signer.invite(
             "pup", ("device",), 1, self.team.wall(), 3600.0, self.team.dice, life=float(DAY)

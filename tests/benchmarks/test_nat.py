@@ -22,14 +22,20 @@ def good(part: str = PLAIN) -> list[Outcome]:
 
 class OutcomeTests(SynchronousTestCase):
     def test_thirteen_of_fifteen_pairs_can_be_punched(self) -> None:
-        """All pairs can be punched except symmetric with symmetric or port restricted, and those without UDP."""
+        """Hole punching works for 13 of the 15 pairs of routers that pass UDP.
+
+        The exceptions are a symmetric router with a symmetric router, and with a port restricted router.
+        """
         pairs = [(a, b) for n, a in enumerate(MATRIX) for b in MATRIX[n:] if NatKind.NOUDP not in (a, b)]
         self.assertEqual(len(pairs), 15)
         closed = [(a.value, b.value) for a, b in pairs if not is_punchable(a, b)]
         self.assertEqual(closed, [("port", "sym"), ("sym", "sym")])
 
     def test_a_good_round_keeps_every_promise(self) -> None:
-        """A good round meets all criteria; a relayed pair that could be punched, or slow pairs, violate a criterion."""
+        """A good round meets all criteria.
+
+        A pair that is relayed although its routers could be punched, or slow pairs, violate a criterion.
+        """
         self.assertEqual([one for one in check_requirements([*good(), *good(LOSS)]) if not one.is_kept], [])
         relayed = good()
         relayed[0].path = "relayed"
@@ -57,13 +63,16 @@ class OutcomeTests(SynchronousTestCase):
         self.assertEqual([one.is_kept for one in check_requirements(blocked)], [False, True, False])
 
     def test_cell(self) -> None:
-        """A cell contains path kinds, median, maximum, and the number of failures."""
+        """A table cell contains path kinds, median, maximum, and the number of failures."""
         some = [Outcome(PLAIN, "port", "port", [took], "direct") for took in (0.1, 0.3, None)]
         self.assertEqual(format_cell(some), "direct 0.20 (0.30), 1 of 3 fail")
         self.assertEqual((format_cell(some[2:]), format_cell([])), ("fails", ""))
 
     def test_report_and_document(self) -> None:
-        """The table contains each kind; the document changes only between its marks, and is refused without marks."""
+        """The table contains each kind of router.
+
+        The document changes only between its marks; a document without marks is refused.
+        """
         self.assertIn("noudp", format_table(good()))
         text = update_document(f"before\n{BEGIN}\nold\n{END}\nafter\n", good())
         self.assertTrue(text.startswith("before\n") and text.endswith("\nafter\n"))

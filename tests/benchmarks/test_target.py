@@ -58,7 +58,7 @@ class TargetTests(SynchronousTestCase):
         self.assertEqual(self.reached(results, None), [14])
 
     def test_each_figure_counts(self) -> None:
-        """One insufficient figure causes exactly the targets that depend on it to be missed."""
+        """If one figure is insufficient, exactly the targets that depend on this figure are missed."""
         spoilt: list[tuple[tuple[str, ...], Any, list[int]]] = [
             (("remote_get", "p50"), 0.91, [1]),
             (("put", "p50"), 0.91, [2, 14]),

@@ -116,7 +116,7 @@ class RobotCase(SynchronousTestCase):
         return math.hypot(*self.body.motion[:2])
 
     def cut_link(self) -> None:
-        """Break the link; a new one can be opened."""
+        """Break the link; the driver can open a new link."""
         if self.connector is None:
             raise NotImplementedError
         self.connector.cut()
@@ -131,5 +131,5 @@ class RobotCase(SynchronousTestCase):
         return self.newest(driver).values.get(key)
 
     def near(self, value: Any, wanted: float, off: float = 0.01) -> None:
-        """Fail if a value differs from the expected value by more than ``off``."""
+        """Fail if a value of the newest observation differs from the expected value by more than ``off``."""
         self.assertLessEqual(abs(float(value) - wanted), off)

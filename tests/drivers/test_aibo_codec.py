@@ -99,7 +99,10 @@ class StateTests(SynchronousTestCase):
         self.assertEqual([struct.unpack_from("<I", old, at)[0] for at in (80, 128)], [11, 10])
 
     def test_reads_both_dialects_byte_by_byte(self) -> None:
-        """Both dialects are recognised by their first bytes and decoded, however the stream is split into chunks."""
+        """World states of both Tekkotsu versions (dialects) are recognised by their first bytes and decoded.
+
+        The result does not depend on how the stream is split into chunks.
+        """
         for dialect in (T4, T2):
             stream = encode_state(felt(dialect)) + encode_state(felt(dialect, 1032))
             for step in (1, 7, len(stream)):
@@ -173,7 +176,7 @@ class MenuTests(SynchronousTestCase):
     )
 
     def test_golden_lines(self) -> None:
-        """The messages for a server start and an empty slot have the bytes of the golden vectors."""
+        """The messages that start a server and that report an empty slot have the bytes of the golden vectors."""
         self.assertEqual(menu.encode_message(self.MESSAGES[2]), b"load\norg.tekkotsu.mon.WalkGUI\nWalkGUI\n10050\n\n")
         self.assertEqual(
             menu.encode_message(Refresh("Root", (Item(0, False, menu.EMPTY_SLOT),))),
@@ -251,7 +254,10 @@ class PictureTests(SynchronousTestCase):
         self.assertEqual(picture.REQUEST, b"connection request")
 
     def test_reads_every_kind_byte_by_byte(self) -> None:
-        """JPEGs, raw, single and blank channels, text and the end are read however the stream is split into chunks."""
+        """Every kind of packet is read however the stream is split into chunks.
+
+        The kinds are JPEGs, raw, single and blank channels, text, and the end of the stream.
+        """
         single = picture.encode_header(1, 0, 4, 2, 9, 10) + picture.encode_block(Block(4, 2, "RawImage", bytes(8)))
         jpegs = b"".join(picture.encode_block(Block(4, 2, "JPEGGrayscale", JPEG, n)) for n in range(3))
         blank = picture.encode_block(Block(0, 0, "blank", b"", 1, 0xFFFFFFFF))
@@ -324,7 +330,10 @@ class PictureTests(SynchronousTestCase):
     @settings(deadline=None, max_examples=200)
     @given(st.binary(max_size=300), st.integers(0, 200))
     def test_survives_any_bytes(self, noise: bytes, keep: int) -> None:
-        """After a valid start, random bytes raise nothing in a stream; in a datagram they give a packet or BadFrame."""
+        """After a valid start, random bytes in a stream raise no exception.
+
+        A datagram of such bytes gives a packet or raises BadFrame.
+        """
         list(PictureReader().read(COLOUR[:keep] + noise))
         with contextlib.suppress(BadFrame):
             picture.decode_message(COLOUR[:keep] + noise)

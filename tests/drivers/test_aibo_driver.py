@@ -34,7 +34,7 @@ class AiboDriverTests(Conformance, AiboCase):
     """The driver of a Tekkotsu 4 dog passes the conformance tests and further tests of its functions."""
 
     def test_senses_what_an_ers7_has(self) -> None:
-        """Ranges, accelerations, power, buttons, joints, switch, dialect and estimated odometry are observed."""
+        """Observations contain ranges, accelerations, power, buttons, joints, switch, dialect and odometry."""
         self.body.values = {"range.near": 0.25, "power.level": 0.5, "imu.ax": 1.0}
         driver = self.ready()
         values = self.newest(driver).values
@@ -75,7 +75,7 @@ class AiboDriverTests(Conformance, AiboCase):
         self.assertEqual(self.true_speed(), 0.0)
 
     def test_shares_the_stride_with_the_turn(self) -> None:
-        """A full turn leaves no speed for walking, and the result of ``act`` shows this."""
+        """A turn at full speed leaves no speed for walking, and the result of ``act`` shows this."""
         driver = self.ready()
         done = driver.act({"base.vx": 0.16, "base.vy": -0.103, "base.wz": 2.03 / 2}, self.permit())
         self.assertAlmostEqual(done["base.vx"], 0.08)
@@ -85,7 +85,7 @@ class AiboDriverTests(Conformance, AiboCase):
     def test_recovers_from_silence(self) -> None:
         """After half a second without a world state the driver is stale.
 
-        When states arrive, it is ready and the dog at rest.
+        When world states arrive again, the driver is ready and the dog is at rest.
         """
         driver = self.ready()
         driver.act({"base.vx": 0.1}, self.permit(seconds=20.0))
@@ -179,7 +179,7 @@ class AiboDriverTests(Conformance, AiboCase):
         self.assertTrue(self.dog.is_engaged)
 
     def test_waits_for_a_port_that_another_client_holds(self) -> None:
-        """Each port accepts one client: a second driver counts the refusals, and connects after the first has left."""
+        """Each port accepts one client, so a second driver is refused until the first driver has disconnected."""
         first = self.ready()
         second = self.make_driver()
         connected = second.connect()
@@ -261,7 +261,7 @@ class AiboDriverTests(Conformance, AiboCase):
         self.successResultOf(connected)
 
     def test_knows_no_sensors_of_another_model(self) -> None:
-        """An unknown model can be driven; its emergency stop and motion are observed, but no sensors."""
+        """A dog of an unknown model can be driven; it reports its emergency stop and motion, but no sensors."""
         driver = self.ready()
         stranger = WorldState(T4, "ERS-210", 5, 6, (1.0,) * 40, (2.0,) * 8, (0.0,) * 8, (0.5,) * 18)
         self.drivers[-1]._on_world_state(stranger)

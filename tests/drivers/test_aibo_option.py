@@ -23,7 +23,10 @@ class AiboOptionTests(SynchronousTestCase):
     """Options in the configuration."""
 
     def test_overrides_what_is_given(self) -> None:
-        """An option for a port replaces only that port; if the camera is off, the description has no camera."""
+        """An option for a port replaces only that port.
+
+        If an option switches the camera off, the description has no camera.
+        """
         self.assertEqual(parse_options({"host": "10.0.0.1", "camera_transport": "udp"}).camera_transport, "udp")
         self.assertEqual(parse_options({"host": "dog1", "ports": {"walk": 5}}).ports, {**PORTS, "walk": 5})
         self.assertIn("camera", describe("aibo", {"host": "dog1"}).capabilities)
@@ -35,7 +38,7 @@ class RecipeTests(SynchronousTestCase):
     """Commands for main control."""
 
     def test_sends_every_name(self) -> None:
-        """Each server is started and stopped under all its names; the settings come first, in both spellings."""
+        """Each server is started and stopped under all its names, after the settings were sent in both spellings."""
         lines = menu.make_start_commands(["walk", "camera"], "tcp", 30.0)
         self.assertEqual(
             lines,
@@ -106,7 +109,7 @@ class WaitTests(SynchronousTestCase):
         self.assertEqual(reactor.getDelayedCalls(), [])
 
     def test_does_not_pester_what_hangs_up_at_once(self) -> None:
-        """The delays grow for a peer that closes each connection at once; a longer connection resets them."""
+        """The delays grow if the peer closes each connection immediately; a longer connection resets the delays."""
         for waits, wanted in ((RETRY_DELAYS_S, [0.5, 1.0, 2.0, 5.0, 5.0]), ((), [0.1, 0.16, 0.256, 0.4096, 0.65536])):
             reactor: Any = MemoryReactorClock()
             line: Any = TcpConnector(reactor, waits).connect("dog1", 10050, _Client())
@@ -156,7 +159,7 @@ class WaitTests(SynchronousTestCase):
 
 
 class _Dead:
-    """A link of a failed network: data that is sent never arrives."""
+    """A link over a failed network; sent data never arrives."""
 
     is_busy = False
 

@@ -33,7 +33,7 @@ class CommandTests(SynchronousTestCase):
         self.assertEqual(codec.encode_text_command("i", 8, -20.4, 9, 130), b"i8 -20 9 130\n")
 
     def test_refuses_what_would_be_another_command(self) -> None:
-        """A skill name with a line feed is refused, and so is an angle whose byte equals the command's end mark."""
+        """A skill name with a line feed is refused, and also an angle that is encoded as the command's end mark."""
         for name in ("", "wk\nd", "8", "a" * 17):
             self.assertRaises(ValueError, codec.encode_skill, name)
         self.assertRaises(ValueError, codec.encode_binary_command, "I", (0, 126))
@@ -92,7 +92,10 @@ class LineTests(SynchronousTestCase):
             self.assertRaises(BadFrame, codec.parse_joints, lines)
 
     def test_attitude_of_both_boards(self) -> None:
-        """Columns without a separating space are split; the order is yaw, pitch, roll, but pitch first on a NyBoard."""
+        """Columns without a space between them are split.
+
+        The columns are yaw, pitch and roll; on a NyBoard the pitch is first.
+        """
         told = codec.parse_attitude(["ICM:   0.1  -0.2   9.8-179.9 -10.0  20.0"])
         self.assertAlmostEqual(told["yaw"], math.radians(-179.9))
         self.assertAlmostEqual(told["pitch"], math.radians(-10.0))
@@ -108,9 +111,9 @@ class LineTests(SynchronousTestCase):
         self.assertRaises(BadFrame, codec.parse_nyboard_attitude, ["1.0"])
 
     def test_volts_and_distance(self) -> None:
-        """The voltages of two cells and distances in centimetres are converted; a distance of 0 is NaN.
+        """The voltages of two cells and distances in centimetres are converted; a distance of 0 becomes NaN.
 
-        Other values are refused.
+        Invalid values are refused.
         """
         self.assertEqual(codec.parse_voltage(["Voltage: 7.95 V"]), 7.95)
         self.assertRaises(BadFrame, codec.parse_voltage, ["Voltage: 79.5 V"])
@@ -121,7 +124,7 @@ class LineTests(SynchronousTestCase):
             self.assertRaises(BadFrame, codec.parse_distance, lines)
 
     def test_says_who_it_is(self) -> None:
-        """The banner, the board's version, an unknown skill and the end token (upper or lower case) are recognised."""
+        """The parser recognises the banner, the version of the board, unknown skills, and the end token in any case."""
         self.assertTrue(codec.is_banner("* Start *"))
         self.assertEqual(codec.parse_board(["Bittle", "Software version: B10_250712"]), "biboard")
         self.assertEqual(codec.parse_board(["Bittle", "Software version: N_250224"]), "nyboard")
@@ -239,7 +242,10 @@ class RequestTableTests(SynchronousTestCase):
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def test_a_command_too_long_has_failed(self) -> None:
-        """A command that exceeds the robot's buffer fails, even if its token follows; the next request succeeds."""
+        """A command that exceeds the robot's buffer fails, even if the robot then sends the end token.
+
+        The next request succeeds.
+        """
         long, next_one = self.dialogue.request(b"i8 10 9 10\n", 1.0), self.dialogue.request(b"j\n", 1.0)
         self.hear("OVF", "i", "=", "0", "5,", "j")
         self.failureResultOf(long, RobotError)
@@ -258,7 +264,10 @@ class RequestTableTests(SynchronousTestCase):
         self.successResultOf(got)
 
     def test_a_rest_says_that_the_gyroscope_is_off(self) -> None:
-        """The token ``g`` that precedes the ``d`` of a rest is not taken for the reply to an attitude request."""
+        """The robot answers the command ``d`` (rest) with ``g`` and then ``d``.
+
+        This ``g`` is not taken for the reply to an attitude request.
+        """
         rest, attitude = self.dialogue.request(b"d\n", 1.0), self.dialogue.request(b"gp\n", 1.0)
         self.hear("g", "d")
         self.successResultOf(rest)
@@ -267,7 +276,7 @@ class RequestTableTests(SynchronousTestCase):
         self.assertEqual(len(self.successResultOf(attitude)), 1)
 
     def test_may_be_ended_while_it_fails_a_question(self) -> None:
-        """An errback may end the dialogue; no request fails twice."""
+        """The errback of a failed request may end the dialogue; no request fails twice."""
         first, second = self.dialogue.request(b"gp\n", 1.0), self.dialogue.request(b"P~", 1.0)
         third = self.dialogue.request(b"j\n", 1.0)
         first.addErrback(lambda _: self.dialogue.fail_all(LinkLost("gone")))
@@ -297,7 +306,7 @@ class OptionTests(SynchronousTestCase):
     """The options of the Bittle."""
 
     def test_describes_what_the_gaits_can_do(self) -> None:
-        """The limits follow from the gaits, without keys for missing axes; the capabilities follow from the board."""
+        """The limits are those of the gaits, without keys for missing axes; the capabilities depend on the board."""
         told = describe("bittle", {"port": "/dev/ttyUSB0", "gaits": {"wkF": [0.1, 0]}, "board": "nyboard"})
         self.assertEqual(told.limits, {"base.vx": (0.0, 0.1)})
         self.assertNotIn("ranger", told.capabilities)

@@ -83,9 +83,9 @@ class BittleDriverTests(Conformance, BittleCase):
         self.near(self.value(driver, "odom.x"), self.body.x, 0.02)
 
     def test_does_skills(self) -> None:
-        """A skill ends by itself; until then the dog refuses actions and stays ready.
+        """A skill ends without a command; until then the driver refuses actions and stays ready.
 
-        The names of gaits are not skills.
+        The names of gaits are not accepted as skills.
         """
         driver = self.ready()
         driver.act({"base.vx": 0.1}, self.permit(seconds=5.0))
@@ -177,7 +177,7 @@ class BittleDriverTests(Conformance, BittleCase):
         self.assertEqual((driver.state, driver.problem), ("ready", ""))
 
     def test_lives_with_a_foul_wire(self) -> None:
-        """With a tenth of the lines lost and a tenth invalid, split and delayed, the dog walks and stops.
+        """If a tenth of the lines is lost and a tenth is invalid, split or delayed, the dog still walks and stops.
 
         The driver counts the errors.
         """
@@ -303,7 +303,7 @@ class WifiTests(BittleCase):
         self.faults.drop = self.faults.garbage = 0.1
         self.faults.split = True
         for _ in range(60):
-            with contextlib.suppress(NotEnabled):  # after a lost connection the dog lies down, then stands up
+            with contextlib.suppress(NotEnabled):  # after a lost connection the dog first lies down and then stands up
                 driver.act({"base.vx": 0.1}, self.permit())
             self.pass_time(0.2)
         self.faults.drop = self.faults.garbage = 0.0

@@ -90,7 +90,7 @@ class StreamReaderTests(SynchronousTestCase):
         )
 
     def test_names_what_is_no_stream(self) -> None:
-        """Each response that is not a picture stream is refused; one line describes the cause or the remedy."""
+        """A response that is not a picture stream is refused; the one-line error states the cause or the remedy."""
         ok = b"HTTP/1.1 200 OK\r\n"
         for data, word in (
             (b"HTTP/1.1 401 Unauthorized\r\n\r\n", "NAME:PASSWORD"),

@@ -105,7 +105,7 @@ class CameraDriverTests(Conformance, RobotCase):
         self.assertRaises(Unsupported, driver.act, {"base.vx": 0.1}, self.permit())
 
     def test_waits_for_a_camera_that_is_not_there(self) -> None:
-        """A missing video raises no exception in the node: ``connect`` waits until ``disconnect`` makes it fail."""
+        """If the video is missing, ``connect`` raises no exception; it waits until ``disconnect`` makes it fail."""
         driver = self.make_driver(source=str(self.folder / "none.avi"))
         connected = driver.connect()
         self.pass_time(10.0)
@@ -187,7 +187,7 @@ class PictureSourceTests(SynchronousTestCase):
         self.assertEqual((second.width, second.height), (100, 50))
 
     def test_begins_a_video_anew(self) -> None:
-        """A video repeats after its end. A video without frames raises LinkLost; the capture is released once."""
+        """A video repeats after its end. A video without frames raises LinkLost, and its capture is released once."""
         lens = Lens(Picture(10, 10), None, Picture(20, 20))
         source = self.capture(lens)
         source.open()
@@ -220,7 +220,7 @@ class PictureSourceTests(SynchronousTestCase):
         self.assertRaises(LinkLost, FolderSource("/nowhere").read_picture)
 
     def test_reel_outlives_what_opencv_throws(self) -> None:
-        """An exception of OpenCV closes the camera, and its name is reported.
+        """An exception of OpenCV closes the camera, and the name of the exception is reported.
 
         The next attempt opens the camera again.
         """

@@ -12,7 +12,10 @@ from drivers.errors import BadFrame
 
 class HeadingTests(SynchronousTestCase):
     def test_reads_what_compasses_send(self) -> None:
-        """Sentences of real compasses give a heading with its deviation applied, and whether it is true or magnetic."""
+        """From sentences of real compasses, the decoder returns the heading and whether it is true or magnetic.
+
+        The deviation in a sentence is applied.
+        """
         for line, degrees, is_true in (
             (b"$HCHDG,98.3,0.0,E,12.6,W*57", 85.7, True),
             (b"$HCHDG,101.1,,,7.1,W*3C", 94.0, True),
@@ -98,7 +101,7 @@ class SentenceReaderTests(SynchronousTestCase):
     @settings(max_examples=200)
     @given(st.lists(st.binary(max_size=30) | st.sampled_from([b"$HCHDG,", b"\r\n", b"1.0,E", b"*57", b"$HEHDT,1,T"])))
     def test_any_bytes(self, pieces: list[bytes]) -> None:
-        """Random bytes give only valid headings, and the same headings whether they arrive whole or byte by byte."""
+        """Random bytes give only valid headings, and the same ones whether the bytes arrive whole or one by one."""
         data = b"".join(pieces)
         whole, cut = SentenceReader(), SentenceReader()
         found = whole.read(data)

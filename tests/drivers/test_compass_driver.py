@@ -35,7 +35,7 @@ class CompassDriverTests(Conformance, RobotCase):
         return math.degrees(self.value(driver, HEADING))
 
     def test_turns_as_the_yard_does(self) -> None:
-        """The heading equals the heading of a simulated dog: counter-clockwise from the x axis."""
+        """The driver reports the heading of a simulated dog, which is counted counter-clockwise from the x axis."""
         driver = self.make_driver()
         driver.connect()
         for degrees in (0.0, 45.0, 90.0, 179.9, -179.9, -90.0, -0.04):
@@ -78,7 +78,7 @@ class CompassDriverTests(Conformance, RobotCase):
     def test_believes_the_best_sentence(self) -> None:
         """If a compass sends several sentence types, the most accurate type is used.
 
-        If it stops, the next best is used.
+        If sentences of this type stop, the next best type is used.
         """
         self.compass.variation = 10.0
         self.compass.kinds = ("HDM", "HDT")
@@ -97,7 +97,7 @@ class CompassDriverTests(Conformance, RobotCase):
     def test_names_why_there_is_no_heading(self) -> None:
         """Refusal, silence, noise and unusable sentences each set ``problem`` and are logged once.
 
-        A heading clears it.
+        A heading clears ``problem``.
         """
         self.connector.is_open = False
         driver = self.make_driver()
@@ -137,7 +137,7 @@ class CompassDriverTests(Conformance, RobotCase):
         self.assertEqual((driver.state, driver.diagnostics()["reconnects"]), ("ready", 1.0))
 
     def test_asks_for_the_baud_rate(self) -> None:
-        """On a serial port, a report on noise contains the baud rate, and a report on a closed device its name."""
+        """On a serial port, the problem with noise contains the baud rate; with a closed device, the device name."""
         self.compass.kinds = ()
         self.options = {"rate": 20, "device": "/dev/ttyUSB1", "baud": 9600}
         driver = self.make_driver()

@@ -168,7 +168,7 @@ class CompositeDriverTests(Conformance, Create2Case):
         compass.stop()
 
     def test_leaves_out_what_is_not_ready(self) -> None:
-        """The values of a silent part are omitted until its next observation; the robot stays ready."""
+        """The values of a silent part are omitted until the part's next observation; the device stays ready."""
         compass = Part(self.clock)
         driver = self.with_parts(compass)
         driver.connect()
@@ -189,7 +189,7 @@ class CompositeDriverTests(Conformance, Create2Case):
         self.assertNotIn("compass.heading", self.newest(driver).values)
 
     def test_says_why_its_robot_is_not_heard(self) -> None:
-        """``problem`` and ``token`` of the device have the values of the robot."""
+        """``problem`` and ``token`` of the composite device are those of its robot."""
         main = Create2Driver(parse_options({"port": "memory"}), "vacuum", self.connector, self.clock)
         driver = combine_drivers(main, [Part(self.clock)], "vacuum")
         self.connector.is_open = False
@@ -199,7 +199,10 @@ class CompositeDriverTests(Conformance, Create2Case):
         driver.disconnect()
 
     def test_is_as_fresh_as_its_robot(self) -> None:
-        """A part's values cause no observation, and do not make the values of a silent robot look new."""
+        """New values of a part (an additional sensor) cause no observation.
+
+        They do not make the values of a silent robot look new.
+        """
         compass = Part(self.clock)
         driver, seen = self.with_parts(compass), list[Observation]()
         driver.subscribe(seen.append)
@@ -219,9 +222,9 @@ class CompositeDriverTests(Conformance, Create2Case):
         self.assertGreater(driver.diagnostics()["age"], age + 0.9)
 
     def test_keeps_what_is_the_robots(self) -> None:
-        """A key or capability of the robot takes precedence over the same one of a part.
+        """If the robot and a part have the same key or capability, the robot's is used.
 
-        Of two equal parts, the first is used.
+        Of two parts with the same key or capability, the first part is used.
         """
         robot, part = Part(self.clock), Part(self.clock)
         alone = combine_drivers(robot, [part], "post")
@@ -273,7 +276,7 @@ class CompositeDriverTests(Conformance, Create2Case):
         self.assertNotIsInstance(self.with_parts(Part(self.clock, "camera")), Filming)
 
     def test_asks_who_knows_the_skill(self) -> None:
-        """A skill is executed by the robot or the part that has it.
+        """A skill is executed by the robot or by the part that has this skill.
 
         The error for an unknown skill lists the known skills.
         """
@@ -285,7 +288,7 @@ class CompositeDriverTests(Conformance, Create2Case):
         self.assertIn("dock, beep, hum", str(error))
 
     def test_outlives_a_part_that_is_none(self) -> None:
-        """A failing part is logged once, and the robot still works; a part that never connects is not logged."""
+        """If a part fails, this is logged once and the robot still works; a part that never connects is not logged."""
         compass, absent = Part(self.clock), Part(self.clock, "camera")
         driver = self.with_parts(compass, absent)
         driver.log = log = KeptLog()  # type: ignore[assignment]

@@ -137,7 +137,7 @@ class Abrupt(Rover):
 
 
 class Lawless(Rover):
-    """Accepts any token."""
+    """Accepts commands with any token, even with an outdated one."""
 
     def act(self, action: Action, permit: Permit) -> Action:
         self._gate._token = None
@@ -214,7 +214,7 @@ class Rash(Rover):
 
 
 class Unmoved(Rover):
-    """Reports that it is ready after its link is lost."""
+    """Still reports that it is ready after its link was lost."""
 
     def link_down(self) -> None:
         self._is_up = True
@@ -263,7 +263,7 @@ class Frail(Subscribers[Observation]):
 
 
 class Fragile(Rover):
-    """Uses the subscribers of ``Frail``."""
+    """A driver that uses the faulty list of subscribers of ``Frail``."""
 
     def __init__(self, *given: Any, **more: Any) -> None:
         super().__init__(*given, **more)
@@ -285,7 +285,7 @@ class Ageless(Rover):
 
 
 class Obliging(Rover):
-    """Accepts any skill."""
+    """Accepts unknown skills."""
 
     def invoke(self, name: str, **arguments: float | str) -> Deferred[Mapping[str, Value]]:
         return succeed({})
@@ -350,7 +350,7 @@ class KitTests(SynchronousTestCase):
         self.assertEqual([(rule, each.__name__) for rule, each in _pairs() if rule not in found[each.__name__]], [])
 
     def test_only_what_is_broken(self) -> None:
-        """A driver that violates one rule passes the other checks."""
+        """A driver that violates one rule passes the checks for all other rules."""
         for rule, driver in (("clips", Boastful), ("refuses", Credulous), ("leaves", Haunting), ("times", Backward)):
             self.assertEqual(list(find_violations(bench(driver))), [rule], driver.__name__)
 

@@ -104,7 +104,7 @@ class StreamTests(SynchronousTestCase):
     @given(values_of(PACKET_IDS), st.integers(1, 90))
     @settings(max_examples=100, deadline=None)
     def test_reads_what_is_written(self, values: dict[str, int], size: int) -> None:
-        """Each frame survives encoding and decoding, also in pieces and with the header byte 19 in its data."""
+        """Each frame is unchanged by encoding and decoding, also in pieces and with the header byte 19 in its data."""
         data = encode_stream_frame(PACKET_IDS, values) * 2
         reader = StreamReader(PACKET_IDS)
         got = [frame for at in range(0, len(data), size) for frame in reader.read(data[at : at + size])]
@@ -112,7 +112,10 @@ class StreamTests(SynchronousTestCase):
         self.assertEqual(reader.bad_frames, 0)
 
     def test_fed_one_byte_at_a_time_with_heads_within(self) -> None:
-        """Frames are found byte by byte from the middle of a frame, even with header bytes in their data."""
+        """If a stream starts in the middle of a frame and arrives byte by byte, the next frames are found.
+
+        This also holds if their data contains header bytes.
+        """
         values = {"left_encoder": 19 * 256 + 78, "right_encoder": 19 * 256 + 78, "charge": 19 * 256 + 78}
         data = encode_stream_frame(PACKET_IDS, values)
         reader = StreamReader(PACKET_IDS)
@@ -122,7 +125,10 @@ class StreamTests(SynchronousTestCase):
         self.assertEqual(reader.bad_frames, 1)
 
     def test_counts_and_skips_what_is_no_frame(self) -> None:
-        """An invalid byte costs one frame, the text of a reboot costs none; the following frames are read."""
+        """An invalid byte destroys one frame; the text that the robot prints at a reboot destroys none.
+
+        The following frames are read.
+        """
         data = encode_stream_frame((29, 13), {"virtual_wall": 1})
         reader = StreamReader((29, 13))
         spoilt = data[:3] + bytes((data[3] ^ 8,)) + data[4:]

@@ -153,7 +153,7 @@ class Create2DriverTests(Conformance, Create2Case):
         self.assertLess(self.true_speed(), 0.01)
 
     def test_beeps(self) -> None:
-        """``beep`` plays the nearest note and returns its frequency.
+        """``beep`` plays the note that is nearest to the requested frequency, and returns the frequency of this note.
 
         Invalid arguments and unknown skills are refused.
         """
@@ -197,7 +197,7 @@ class Create2DriverTests(Conformance, Create2Case):
         self.assertEqual((driver.state, self.robot.mode, driver.diagnostics()["safety_events"]), ("ready", 2, 0))
 
     def test_stops_a_robot_that_it_no_longer_hears(self) -> None:
-        """A robot that receives but does not send is stopped within a second, and ``problem`` reports its silence."""
+        """If the robot receives but sends nothing, the driver stops it within a second and sets ``problem``."""
         driver = self.ready()
         driver.act({"base.vx": 0.2}, self.permit(seconds=9.0))
         self.pass_time(0.2)
@@ -224,9 +224,9 @@ class Create2DriverTests(Conformance, Create2Case):
         self.assertGreater(driver.diagnostics()["bad_frames"], 2)
 
     def test_lives_with_a_foul_wire(self) -> None:
-        """With a tenth of the frames lost and a tenth invalid, delayed and split, the driver works.
+        """If a tenth of the frames is lost and a tenth is invalid, delayed or split, the driver still works.
 
-        It counts the invalid frames.
+        The driver counts the invalid frames.
         """
         driver = self.ready()
         self.faults.drop = self.faults.garbage = 0.1

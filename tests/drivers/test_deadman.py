@@ -74,7 +74,7 @@ class HaltTimerTests(SynchronousTestCase):
         self.timer.arm(10.0)
 
     def test_halts_when_the_time_is_over(self) -> None:
-        """The halt is sent after the deadline plus a grace period, repeated to three in total, and counted once."""
+        """The halt is sent three times after the deadline plus a grace period, and counted once."""
         wait = self.timer.get_timeout(9.0)
         self.assertIsNotNone(wait)
         self.assertAlmostEqual(wait or 0.0, 1.0 + GRACE_S)
@@ -90,7 +90,10 @@ class HaltTimerTests(SynchronousTestCase):
         self.assertIsNone(self.timer.get_timeout(20.0))
 
     def test_heeds_newer_words(self) -> None:
-        """A new deadline replaces the old deadline, and rest removes it; both end the repetition of a halt."""
+        """A new deadline replaces the old deadline; ``disarm`` removes the deadline.
+
+        Both end the repetition of a halt.
+        """
         self.timer.arm(11.0)
         self.timer.send_due_halts(10.5)
         self.assertEqual(self.link.said, [])
@@ -117,9 +120,9 @@ class HaltTimerTests(SynchronousTestCase):
         self.assertIsNone(still.get_timeout(5.0))
 
     def test_lets_go_of_what_was_guarded(self) -> None:
-        """A new channel replaces and closes the old channel; the deadline stays.
+        """A new channel to the robot replaces and closes the old channel; the deadline is kept.
 
-        Without a channel nothing is sent or counted.
+        Without a channel no halt is sent or counted.
         """
         other = RecordingLink()
         self.timer.set_halt_command(other, b"other")
@@ -167,7 +170,7 @@ class MessageParserTests(SynchronousTestCase):
     """The messages to the process of the switch."""
 
     def test_hears_words_cut_anyhow(self) -> None:
-        """Messages are read however they are split into chunks, and each file descriptor belongs to its message."""
+        """Messages are read however they are split into chunks, and each gets the file descriptor sent with it."""
         said = HEADER.pack(SET_LINK, 0.0, 4) + b"halt" + HEADER.pack(ARM, 7.5, 0) + HEADER.pack(DISARM, 0.0, 0)
         said += HEADER.pack(LINK_LOST, 0.0, 0) + HEADER.pack(SET_LINK, 0.0, 0)
         call = b"10.0.0.5\x0080\0GET /x\0y"
@@ -247,7 +250,7 @@ class BaseDriverTests(SynchronousTestCase):
     def test_tells_before_it_commands(self) -> None:
         """The switch gets the deadline before the robot gets the motion.
 
-        At the end it gets rest, then the robot the halt.
+        At the deadline the switch is disarmed first, and then the robot gets the halt.
         """
         self.driver.act({"base.vx": 0.1}, Permit(1, 0.2))
         self.assertEqual(self.switch.seconds, 0.2)
@@ -263,7 +266,7 @@ class BaseDriverTests(SynchronousTestCase):
         self.assertEqual((self.switch.seconds, self.switch.calls.count("until")), (0.2, 1))
 
     def test_what_is_over_is_over(self) -> None:
-        """If a motion is over but its timer has not run yet, the next command starts from rest."""
+        """If the deadline of a motion has passed but its timer has not run yet, the next command starts from rest."""
         self.driver.act({"base.vx": 0.1}, Permit(1, 0.2))
         self.clock.rightNow = 0.22  # time passes, but no timer runs
         self.assertEqual(self.driver.act({}, Permit(1, 0.5)), {"base.vx": 0.0})

@@ -1,4 +1,4 @@
-"""Tests of drivers from other distributions, found by entry point or by ``module:Class``."""
+"""Tests of drivers from other Python packages, found by entry point or by ``module:Class``."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MODULES = ("rover_of_tests", "torn_of_tests", "plain_of_tests")
 
 class ForeignTests(SynchronousTestCase):
     def setUp(self) -> None:
-        """Add a distribution with a working driver and broken drivers to the path of this process, as pip does."""
+        """Add a Python package with a working driver and broken drivers to the path of this process, as pip does."""
         folder = Path(self.mktemp()).resolve()
         (folder / "rovers-1.dist-info").mkdir(parents=True)
         (folder / "rovers-1.dist-info" / "METADATA").write_text("Name: rovers\nVersion: 1\n")
@@ -36,7 +36,7 @@ class ForeignTests(SynchronousTestCase):
         self.addCleanup(lambda: [sys.modules.pop(name, None) for name in MODULES])
 
     def refused(self, kind: str) -> str:
-        """Return the one-line error of a refused kind."""
+        """Return the one-line error for a kind of driver that is refused."""
         lines = {
             str(self.assertRaises(UsageError, create_driver, kind, {"host": "x"}, "dog1", Clock())),
             str(self.assertRaises(UsageError, describe, kind, {"host": "x"})),

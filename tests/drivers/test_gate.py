@@ -53,7 +53,7 @@ class GateTests(SynchronousTestCase):
         self.assertRaises(StaleCommand, gate.admit, Permit(3, 9.0), 3.0)
 
     def test_learns_from_a_gate_further_down(self) -> None:
-        """A higher token that the robot reports is stored; commands with lower tokens are then refused."""
+        """If the robot reports a higher token, the gate stores it, and then refuses commands with lower tokens."""
         gate = Gate()
         for token, known in ((0, None), (7, 7), (5, 7)):
             gate.learn(token)

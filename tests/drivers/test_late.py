@@ -83,7 +83,7 @@ class LateTests(RobotCase):
         self.freeze(self.enabled("create2", connector, port="memory"), 0.5, before=0.1)
 
     def test_silence_of_a_frozen_node_is_not_the_robots(self) -> None:
-        """After a pause of the node, the driver does not consider an active robot silent."""
+        """After a pause of the node, the driver does not take an active robot for a silent one."""
         collector = WarningCollector()
         self.addCleanup(collector.close)
         for phase in range(5):

@@ -38,7 +38,7 @@ class PhoneDriverTests(Conformance, RobotCase):
         self.assertIsInstance(create_driver("phone", {}, "anna", self.clock), PhoneDriver)
 
     def test_tells_where_it_sees_the_target(self) -> None:
-        """The page's measurements are in the observation that contains the frame; without a target they are NaN."""
+        """An observation with a frame contains the page's measurements of the target; without a target they are NaN."""
         driver = self.make_driver()
         driver.process_picture(JPEG, 208, 156, {})
         self.assertIsNone(driver.observe(), "nothing is taken before connect")

@@ -68,7 +68,7 @@ class MotionTests(_Lab):
     def test_shares_become_speeds(self) -> None:
         """A relative speed is scaled by the robot's limit, which differs between forward and backward.
 
-        Left is positive.
+        Positive turns and sideways motions are to the left.
         """
         self.pyro.move(0.5, 0.0)
         self.assertEqual(self.moved(), (0.08, 0.0, 0.0))
@@ -150,7 +150,7 @@ class MotionTests(_Lab):
 
 class ThreadTests(_Lab):
     def test_every_call_goes_where_the_driver_lives(self) -> None:
-        """Motion, update, stop and sound are executed through ``call``; no other thread uses the driver."""
+        """Motion, update, stop and sound use the driver only through ``call``, in the thread of the driver."""
         calls: list[Callable[[], Any]] = []
         robot = PyroRobot(self.driver, self.clock, calls.append)
         robot.move(0.5, 0.0)
@@ -172,7 +172,10 @@ class DeviceTests(_Lab):
         self.pyro.update()
 
     def test_range_sensor_has_values_groups_and_units(self) -> None:
-        """Range readings are available in robot diameters, metres and fractions, one by one, by group and by angle."""
+        """Range readings are available one by one, by group and by angle.
+
+        Their units are robot diameters, metres, or fractions.
+        """
         self.feel(range_near=0.3, range_far=0.36)
         far = self.pyro.range
         self.assertEqual([round(v, 3) for v in far.distance("M")], [0.3, 0.36, 1.5])
@@ -263,7 +266,10 @@ class DeviceTests(_Lab):
 
 class FilterTests(SynchronousTestCase):
     def test_function_as_a_filter(self) -> None:
-        """A filter function may apply other filters, and runs once per picture; two matches mark both colours."""
+        """A filter may be a function, which may apply further filters and runs once per picture.
+
+        Two matches mark both colours.
+        """
         camera = Camera(104, 80)
 
         def process(one: Camera) -> Any:
@@ -291,7 +297,10 @@ class Create2Tests(_Lab):
         self.connector = MemoryConnector(self.clock, self.robot.accept)
 
     def test_robot_without_ranger_has_bumpers(self) -> None:
-        """Bumpers are ordered from the left; using the missing range sensor or moving sideways raises an error."""
+        """The bumpers of a robot without a ranger are ordered from the left.
+
+        The use of the missing range sensor and sideways motion raise an error.
+        """
         self.assertEqual(self.pyro.builtinDevices, ["battery", "bumper", "position"])
         self.assertEqual((self.pyro.bumper[0].value, self.pyro.stall), ([0.0, 0.0], 0))
         self.body.values["bump.right"] = True

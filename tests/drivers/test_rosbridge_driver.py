@@ -40,7 +40,7 @@ class RosbridgeDriverTests(Conformance, RobotCase):
         return [said for said in self.robot.received_messages if said["op"] == op]
 
     def test_drives_with_the_type_that_the_robot_listens_to(self) -> None:
-        """The driver queries the robot's velocity type, so robots with Twist and with TwistStamped need no option."""
+        """The driver queries which velocity type the robot uses, so neither Twist nor TwistStamped needs an option."""
         for kind in ("geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped", "geometry_msgs/Twist"):
             self.robot.velocity_type = kind
             driver = self.ready()
@@ -52,7 +52,10 @@ class RosbridgeDriverTests(Conformance, RobotCase):
             self.pass_time(0.1)
 
     def test_takes_twist_where_nobody_can_be_asked(self) -> None:
-        """Without rosapi the driver waits one second and then uses Twist; with an explicit type it does not wait."""
+        """Without rosapi the driver waits one second and then uses Twist.
+
+        If an option states the type, the driver does not wait.
+        """
         self.robot.has_rosapi = False
         driver = self.make_driver()
         connected = driver.connect()
@@ -155,7 +158,10 @@ class RosbridgeDriverTests(Conformance, RobotCase):
         self.assertEqual(driver.description.capabilities["camera"]["fps"], 10.0)
 
     def test_asks_for_as_many_pictures_as_are_wanted(self) -> None:
-        """A new frame rate renews the subscription, zero ends it; a robot without an image topic has no camera."""
+        """A new frame rate renews the subscription to frames, and the rate zero ends it.
+
+        A robot without an image topic has no camera.
+        """
         driver = self.ready(image_topic=IMAGE, camera_fps=5)
         driver.set_camera_fps(0)
         self.pass_time(0.1)
@@ -182,7 +188,7 @@ class RosbridgeDriverTests(Conformance, RobotCase):
         self.assertEqual((driver.state, self.values(driver)["power.level"]), ("ready", 0.8))
 
     def test_switches_motors_that_there_are(self) -> None:
-        """``enable`` and ``disable`` call the motor service; if that service is missing, they fail with NoReply."""
+        """``enable`` and ``disable`` call the motor service, and fail with NoReply if this service is missing."""
         self.robot.has_motor_power = False
         driver = self.ready(motor_service="/motor_power")
         self.assertTrue(self.robot.has_motor_power)
@@ -229,7 +235,7 @@ class RosbridgeDriverTests(Conformance, RobotCase):
         self.assertEqual(log.lines, ["robot: rosbridge says: no such type"])
 
     def test_calls_what_speaks_no_rosbridge_ever_more_slowly(self) -> None:
-        """A server that is not rosbridge is retried with delays of up to five seconds; ``connect`` waits."""
+        """The driver retries a server that is not rosbridge, with delays of up to 5 s; ``connect`` still waits."""
         calls: list[float] = []
 
         class Web:
@@ -258,7 +264,7 @@ class RosbridgeDriverTests(Conformance, RobotCase):
             self.failureResultOf(connected, LinkLost)
 
     def test_lives_with_a_foul_wire(self) -> None:
-        """Invalid, lost, delayed and split data cost frames and links; after these faults the driver is ready again."""
+        """Invalid, lost, delayed and split data destroy frames and links; after these faults the driver is ready."""
         driver = self.ready(image_topic=IMAGE)
         self.robot.faults.garbage, self.robot.faults.drop = 0.1, 0.05
         self.robot.faults.split, self.robot.faults.delay = True, 0.02

@@ -122,7 +122,7 @@ class SerialTests(SynchronousTestCase):
     def test_names_errors_without_a_number(self) -> None:
         """An unknown error is reported with its own text.
 
-        If a system error caused it, with the text of the system error.
+        If a system error caused the unknown error, the text of the system error is reported.
         """
         self.assertIn("strange baud", describe_problem(ValueError("strange\nbaud")))
         try:

@@ -167,7 +167,7 @@ class SimDriverAloneTests(SynchronousTestCase):
         self.assertIn(encode_message(Motors(True)), self.robots[0].heard)
 
     def test_answers_every_switch(self) -> None:
-        """If a motor switch is requested while another one fails, all requests get the result of the last one."""
+        """If the motors are switched while an earlier switch request fails, all requests get the last result."""
         again: list[Deferred[bool]] = []
         self.driver.enable().addErrback(lambda _: again.append(self.driver.enable()))
         last = self.driver.disable()

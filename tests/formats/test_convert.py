@@ -58,9 +58,9 @@ class ConvertTests(SynchronousTestCase):
         return error
 
     def test_converts(self) -> None:
-        """Integers become floats where floats are declared, lists become tuples.
+        """Integers become floats where floats are declared, and lists become tuples.
 
-        Then the ``ConversionStep`` is applied.
+        After this conversion the ``ConversionStep`` is applied.
         """
         given = {"name": "a", "rate": 2, "sizes": [1, 1, 2], "parts": [{"kind": "camera"}], "word": "ay"}
         table = convert_table(given, _Table)
@@ -68,7 +68,7 @@ class ConvertTests(SynchronousTestCase):
         self.assertIsInstance(table.rate, float)
 
     def test_refuses_wrong_types_and_bounds(self) -> None:
-        """Values are not coerced: a boolean is not a number, text is not a number, and NaN is in no range."""
+        """Values are not coerced: neither a boolean nor a text is a number, and NaN is in no range."""
         nan, inf = float("nan"), float("inf")
         wrong: dict[str, list[object]] = {
             "name": ["", "x" * 9, 1, None, "a\nb"],

@@ -27,7 +27,7 @@ class HeadTests(SynchronousTestCase):
         self.assertIsNone(pop_head(bytearray(b"x" + longest)))
 
     def test_said_for_people(self) -> None:
-        """The description is the start of the first line as text, whatever bytes it contains, even if it is empty."""
+        """The description is the start of the first line as text, even if this line has invalid bytes or is empty."""
         for bare, said in ((b"SSH-2.0-box", "SSH-2.0-box"), (b"", ""), (b"\xff" + b"x" * 99, "\ufffd" + "x" * 59)):
             found = pop_head(bytearray(bare + b"\r\n\r\n"))
             assert found is not None

@@ -28,6 +28,6 @@ class JpegTests(SynchronousTestCase):
     @settings(max_examples=100)
     @given(st.binary(max_size=40))
     def test_any_bytes(self, data: bytes) -> None:
-        """With any bytes between the markers of a JPEG, the result is a size or None."""
+        """For any bytes between the start and end markers of a JPEG, the result is a size or None."""
         size = read_size(b"\xff\xd8" + data + b"\xff\xd9")
         self.assertTrue(size is None or min(size) > 0)

@@ -37,7 +37,7 @@ def client() -> Plain:
 
 class GreetingTests(SynchronousTestCase):
     def test_refused_greetings(self) -> None:
-        """A rejected handshake opens no connection and ends reading; a server replies with HTTP 400."""
+        """After a rejected handshake no connection is open and no data is read; a server replies with HTTP 400."""
         for old, new in ((b"101 Switching", b"200 OK"), (b"Accept: ", b"Accept: x"), (b"e: websocket", b"e: h2c")):
             one = Plain()
             answer = answer_to(one.opening())

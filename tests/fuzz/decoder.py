@@ -31,7 +31,7 @@ def check(data: bytes) -> None:
         packed = pack_receipt(receipt.key, receipt.is_done, receipt.room, receipt.cause, receipt.received)
         if parse_receipt(packed) != receipt._replace(next=parse_receipt(packed).next):
             raise Violation("a receipt that is another one when it is packed and read again")
-    with contextlib.suppress(Exception):  # excluded: this kind only contains fields that the decoders below read
+    with contextlib.suppress(Exception):  # this kind is excluded, because the decoders below read all of its fields
         fields = msgpack.unpackb(data, strict_map_key=False)
         _records(fields)
 

@@ -29,7 +29,7 @@ def shot(ground: Ground, data: bytes) -> None:
         counted = ground.target.counters["malformed"]
         before = _lasting(ground)
         ground.shoot(session.seal(plain), ground.other.address)
-        # A last fragment completes a message and so changes the state, whatever its content is.
+        # The last fragment of a message completes the message and so changes the state, whatever the content is.
         is_whole = plain[:1] != bytes([PART])
         if is_whole and ground.target.counters["malformed"] > counted and _lasting(ground) != before:
             raise Violation("a malformed message changed the node")

@@ -146,7 +146,7 @@ class Ground:
         return tapped_network
 
     def __call__(self, event: Any) -> None:
-        """Record warnings during an input, except rejections of peers, which have a ``code``."""
+        """Record the warnings that an input causes, except rejections of peers, which have a ``code``."""
         if event["log_level"] >= LogLevel.warn and "code" not in event:
             self.errors.append(str(event.get("log_format")))
 

@@ -125,7 +125,7 @@ class Session:
                 raise KeyboardInterrupt
 
     def _interrupt(self, *_: object) -> None:
-        """End after the present schedule. During a schedule, a Deferred would catch the interrupt as its failure."""
+        """End after the present schedule; an exception during a schedule would be caught as a failure of a Deferred."""
         self._is_interrupted = True
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -145,7 +145,7 @@ class Session:
         say(f"        {kept} of {whole.faults} faults remain after {left.runs} runs: {left.outcome.found[0]}")
 
     def _log(self, seeds: range) -> None:
-        """Run the seeds in stretches; log each finished seed, even if the run is interrupted."""
+        """Run the seeds in several groups; log each finished seed, even if the run is interrupted."""
         args, what = self._args, "+".join(self._trim.only)
         text = Path(args.log).read_text(encoding="utf-8") if os.path.exists(args.log) else ""
         logged = seed_log.parse_entries(text, args.log)
@@ -171,7 +171,7 @@ class Session:
 
 
 def until_then(moment: float) -> Callable[[], bool]:
-    """Return a function that returns whether ``moment`` has passed."""
+    """Return a function that tells whether ``moment`` has passed."""
     return lambda: time.monotonic() > moment
 
 

@@ -27,7 +27,7 @@ LINE = 12
 
 
 class Deciders(Workload):
-    """Lets random teams decide, and bidders in a line bid; independent of the faults in the schedule."""
+    """Lets random teams decide, and bidders in a line bid. The faults of the schedule have no effect on it."""
 
     def __init__(self, schedule: Schedule) -> None:
         self._rng = random.Random(f"deciders/{schedule.seed}")
@@ -60,7 +60,7 @@ class Deciders(Workload):
 
 
 def stopped(mission: Mission) -> dict[str, list[str]]:
-    """Return the owners of each task after bidders in a line have bid; each bidder stops independently."""
+    """Return the owners of each task after bidders in a line (each talks to its neighbours) have all stopped."""
     names = mission.alive
     near = {a: [names[m] for m in (n - 1, n + 1) if 0 <= m < len(names)] for n, a in enumerate(names)}
     bidders = {}

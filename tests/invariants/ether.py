@@ -66,7 +66,7 @@ class Ether:
         clock.callLater(REPEAT, self._repeat)
 
     def reaches(self, one: int, other: int) -> bool:
-        """Return whether messages between the two places can arrive."""
+        """Return whether messages between the two nodes (given by their numbers) can arrive."""
         return self.side.get(one, 0) == self.side.get(other, 0)
 
     def send(self, source: int, target: int, deliver: Callable[[], None]) -> None:
@@ -77,7 +77,7 @@ class Ether:
                 self.clock.callLater(self.conditions.delay * self.rng.uniform(0.2, 3.0), deliver)
 
     def everywhere(self, source: int, change: Callable[[int], None]) -> None:
-        """Apply a change at ``source`` immediately, and at each other node when the message arrives."""
+        """Apply a change at the node ``source`` immediately, and at every other node when its message arrives."""
         change(source)
         for target in range(len(self.replicas)):
             if target != source:
@@ -128,7 +128,7 @@ class Ether:
             self.send(place, target, lambda target=target: self._member(target, place, task_id, member))  # type: ignore[misc]
 
     def results(self, place: int, task_id: str) -> list[Record]:
-        """Return the outcomes that the node at this place knows, as records."""
+        """Return the outcomes that the node with this number knows, as records."""
         known = self.replicas[place].results.get(task_id, {})
         return [
             Record(group_key(task_id), RESULT, bytes(32), 1, "team", 1.0, result.pack(), bytes(64))
@@ -136,7 +136,7 @@ class Ether:
         ]
 
     def outcome(self, place: int, task_id: str) -> Result | None:
-        """Return the outcome of a task that the node at this place knows."""
+        """Return the outcome of a task as the node with this number knows it."""
         known = self.replicas[place].results.get(task_id, {})
         return known[max(known)] if known else None
 

@@ -1,8 +1,8 @@
 """The workload of leases: agents claim, keep, lose and return leases under all faults.
 
-It checks the invariants E1 to E3, E5, E8 and E9. It has its own small world, so a thousand schedules take two minutes:
-the classes of the protocol, simulated machines and a simulated link. The assignments are random, because leases must be
-exclusive for any assignment.
+The workload checks the invariants E1 to E3, E5, E8 and E9. Its world is small, so a thousand schedules take two
+minutes; it consists of the classes of the protocol, simulated machines and a simulated link. The assignments are
+random, because leases must be exclusive for any assignment.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ KINDS = (
 
 
 def draw_faults(rng: random.Random, n: int, agents: Sequence[int], has_stores: bool) -> list[TimedFault]:
-    """Return random faults for a schedule with ``n`` places; the places of agents are chosen more often."""
+    """Return random faults for a schedule with ``n`` nodes; nodes with agents are chosen more often."""
     faults = []
     for _ in range(rng.choice([1, 2, 3, 3, 4, 6])):
         at = rng.uniform(0.5, 12.0)
@@ -56,7 +56,7 @@ def draw_faults(rng: random.Random, n: int, agents: Sequence[int], has_stores: b
 
 
 class Leases(LeaseTeam):
-    """The run that ``seed`` completely determines."""
+    """A schedule of the workload, which ``seed`` completely determines."""
 
     def __init__(self, seed: int, trim: Reduction = NO_REDUCTION, ttl: float = TTL) -> None:
         rng = self._schedule_rng = random.Random(f"leases/{seed}")
@@ -64,7 +64,7 @@ class Leases(LeaseTeam):
         agents = rng.choice([2, 3, 3, 4])
         stop_time = rng.choice([0.0, 0.0, 0.3])
         drift = rng.choice([0.0, 0.01, 0.01, 0.01, 0.05])
-        # The worst permitted combination, a slow holder and fast members, must occur often.
+        # The worst permitted combination of clocks, a slow holder and fast members, must occur often.
         rates = [1.0 + rng.choice([-1, 1]) * drift for _ in range(n)]
         # Without stores a restarted member loses all its state; councils then do not change, and tokens may decrease.
         has_stores = rng.random() < 0.7
@@ -101,7 +101,7 @@ class Leases(LeaseTeam):
         )
 
     def run(self) -> list[str]:  # type: ignore[override]
-        """Run the faults and then the healthy phase; return one line per violation."""
+        """Run the faults and then a phase without faults; return one line per violation."""
         self.clock.advance(self.ttl + 0.1)
         self.radio.quality = self.air
         self.recorder.record_assumptions()
@@ -147,7 +147,7 @@ class Leases(LeaseTeam):
                 self.nodes[place] = self.start_life(place)
 
     def _verify_health(self, task_id: str) -> None:
-        """Without faults, let one agent after the other leave; check E3, the graceful leave and E5."""
+        """Without faults, let one agent after the other leave; check invariants E3 and E5, and the graceful leave."""
         if not self.has_stores:
             # A lease that no member remembers must end first, because the next lease may have the same token.
             self.clock.advance(self.ttl)
@@ -204,7 +204,7 @@ class Leases(LeaseTeam):
         self._heal()
 
     def _conclude(self, task_id: str) -> None:
-        """Let the executing agent complete the task, or cancel the task.
+        """Let the executing agent complete the task, or let the last node cancel the task.
 
         After the acknowledgement no robot may move.
         """
@@ -288,7 +288,7 @@ class Leases(LeaseTeam):
         self.recorder.record_reachability()
 
     def _clog(self, *places: int) -> None:
-        """Disconnect these places, unless the healthy phase has begun."""
+        """Disconnect the nodes with these numbers, unless the phase without faults has begun."""
         if not self._is_well:
             self._part(places)
             self.recorder.record_reachability()

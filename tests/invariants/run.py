@@ -145,7 +145,7 @@ def hunt_all(seeds: Sequence[int], jobs: int, scheduler: str = "") -> Iterator[H
 
 @dataclass(frozen=True)
 class Least:
-    """The smallest failing ``trim``, its outcome, and the number of ``runs`` that were needed to find it."""
+    """The smallest part of a schedule (``trim``) that still fails, its outcome, and the number of ``runs`` needed."""
 
     trim: Reduction
     outcome: Outcome
@@ -158,9 +158,9 @@ def least(
     is_over: Callable[[], bool] = lambda: False,
     whole: Reduction = NO_REDUCTION,
 ) -> Least:
-    """Reduce a failed schedule that still violates the same invariant, until ``is_over`` returns true.
+    """Reduce a failed schedule as long as it violates the same invariant, until ``is_over`` returns true.
 
-    ``whole`` is the part of the schedule that the failed run had.
+    ``whole`` is the part of the schedule that the failed run executed.
     """
     invariant = outcome.found[0].partition(":")[0]
     best, runs = Least(replace(whole, only=outcome.names), outcome, 0), 0
@@ -178,7 +178,7 @@ def least(
 
     worlds = outcome.worlds
     if len(worlds) > 1:
-        # The worlds are independent, so one of them fails by itself.
+        # The worlds are independent, so at least one of them also fails when it runs alone.
         any(fails(replace(whole, only=world)) for world in worlds)
     left = best.outcome
     reduce_run(best.trim, left.faults, left.names if len(left.worlds) == 1 else (), left.seconds, fails)

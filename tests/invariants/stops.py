@@ -152,7 +152,7 @@ class Life:
         return succeed(1)
 
     def get(self, key: bytes) -> Deferred[list[Record]]:
-        """Read from a majority."""
+        """Read the records from a majority of the replicas."""
         near = [other for other in NODES if self.net.reaches(self.name, other)]
         if len(near) <= len(NODES) // 2:
             return fail(Unavailable(len(near), len(NODES) // 2 + 1))
@@ -235,7 +235,7 @@ class Net:
                 self.lives[name].look()
 
     def reached(self, name: str, records: list[Record]) -> None:
-        """Record the releases that reach a robot in records of members that may stop the team."""
+        """Record which releases reach a robot in records; only members that may stop the team count."""
         for record in records:
             if name in ROBOTS and self.may(record.owner) and _is_msgpack(record.value):
                 self.released(name, msgpack.unpackb(record.value or b""))
@@ -387,7 +387,10 @@ class Net:
             self.counts["revoked"] += 1
 
     def attack(self) -> None:
-        """Send a hostile message from a member that must not stop the team, or with an invented or stolen key."""
+        """Send a hostile message.
+
+        Its sender is a member that must not stop the team, or has an invented or stolen key.
+        """
         self.counts["hostile"] += 1
         sender = self.rng.choice(("eye", "boot", "dog1", "thief", OUTSIDE))
         known = list(self.tracked)

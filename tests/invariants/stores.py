@@ -1,4 +1,4 @@
-"""The workload of stores: full and corrupt disks; it checks S-a to S-c for nodes that lose power."""
+"""The workload of stores, with full and corrupt disks; it checks invariants S-a to S-c after power failures."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Stores(Workload):
                 place = self._rng.choice(alive)
                 self._full = (place, self._fleet.get_store(place))
                 self._full[1].writer.fault = FULL
-                # The fault may last longer than the other faults, but not longer than the repair interval.
+                # This fault may last longer than other kinds of faults, but not longer than the repair interval.
                 self._fleet.clock.callLater(self._rng.choice([1.0, 4.0, 8.0]), self._make_room)
             return
         place, store = self._full

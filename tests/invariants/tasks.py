@@ -1,7 +1,7 @@
 """The workload of tasks: complete agents over a network in memory, with all their decisions and actions.
 
-It checks the invariants E4 to E7 and needs no team of nodes: ``python -m tests.invariants --only tasks`` runs it alone,
-in milliseconds per schedule.
+The workload checks the invariants E4 to E7 and needs no team of nodes. ``python -m tests.invariants --only tasks`` runs
+only this workload, in milliseconds per schedule.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ HEARD = 3.0
 
 
 class Tasks:
-    """One schedule of agents, tasks and faults, which ``seed`` determines."""
+    """One schedule of agents, tasks and faults; ``seed`` determines the whole schedule."""
 
     def __init__(self, seed: int, trim: Reduction = NO_REDUCTION) -> None:
         self.rng = random.Random(f"tasks/{seed}")
@@ -106,7 +106,7 @@ class Tasks:
         agent.startService()
 
     def death(self, place: int) -> None:
-        """End an agent without notifying the others."""
+        """End an agent without notifying the other agents."""
         self.history.record(Died, place)
         del self.ether.nodes[place]
         self.agents.pop(place).stopService()
@@ -192,7 +192,7 @@ class Tasks:
         return not any(task_queue.open_ids or any(map(task_queue.is_new, self.tasks)) for task_queue in task_queues)
 
     def late(self) -> None:
-        """Let the record of each outcome expire although its task is still listed."""
+        """Let the record of each outcome expire although the task is still listed."""
         for name in self.tasks:
             if self.ether.outcome(OPERATOR, name) is not None:
                 self.history.record(OutcomeExpired, name)

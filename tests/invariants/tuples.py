@@ -72,7 +72,7 @@ class Tuples(Workload):
             act(place, self._spaces[place])
 
     def make_final_requests(self) -> None:
-        """Let all nodes read all tuples, put the bell, and take the remaining tuples, finally one by one."""
+        """Let all nodes read all tuples, put the bell tuple, and take the remaining tuples, at the end one by one."""
         for place, space in sorted(self._spaces.items()):
             self._survey(place, space)
             self._listen(f"node {place}, which waits without faults", space)
@@ -96,7 +96,7 @@ class Tuples(Workload):
         space = self._spaces[place] = TupleSpace(node, self._clock, rng)
         self._witness.wrap_member(node.take_acceptor, node.endpoint.expose, node.identity.public)
         if place < 2:
-            # Later, because the node may not have started yet.
+            # The call is delayed, because possibly the node has not started yet.
             self._clock.callLater(0.1, self._wait, place, space)
 
     def _died(self, place: int, node: EntangledNode) -> None:
@@ -113,7 +113,7 @@ class Tuples(Workload):
         return [p for p in self._witness.list_undecided() if p.fields in self._acknowledged and self._can_decide(p)]
 
     def _can_decide(self, stored_tuple: StoredTuple) -> bool:
-        """Return whether a majority of the council is online and has its state."""
+        """Return whether a majority of the council members is online and has kept its state."""
         acceptors = {
             node.identity.public: node.take_acceptor for node in map(self._schedule.node, self._schedule.alive())
         }
@@ -152,7 +152,7 @@ class Tuples(Workload):
         claiming.addCallbacks(lambda claim: self._claimed(claim, place, space), _weather)
 
     def _claimed(self, claim: Claim, place: int, space: TupleSpace) -> None:
-        """Confirm the claim in time, late or twice, release it, or forget it like a failed client."""
+        """Confirm the claim in time, too late or twice, or release it, or do nothing, like a failed client."""
         fate = self._rng.choice(["confirm", "late", "release", "forget"])
         if fate == "release":
             claim.release()
@@ -218,7 +218,7 @@ class Tuples(Workload):
         self._taking(self._spaces[place].get_many(JOB, 1000), place)
 
     def _fetch(self) -> None:
-        """Wait for each tuple separately, so a tuple that cannot be taken does not block the others."""
+        """Wait for each tuple separately, so a tuple that cannot be taken does not block the other tuples."""
         for posted in self._left():
             place = self._rng.choice(sorted(self._spaces))
             self._get(posted.fields, place, self._spaces[place])

@@ -116,7 +116,7 @@ class Robot:
 
 
 def restarted(robot: Robot, clock: HeapClock) -> Robot:
-    """Return the robot for its restarted node; the gate is the same."""
+    """Return the robot as its restarted node sees it; the gate, and so the highest token, is kept."""
     again = Robot(clock, robot.place)
     again._gate = robot._gate
     return again

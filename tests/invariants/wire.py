@@ -1,6 +1,6 @@
-"""The workload of the wire: injects datagrams that no correct node sends, and checks their effects (R1 to R4).
+"""The workload of the wire: injects datagrams that no correct node sends, and checks invariants R1 to R4.
 
-The datagrams are derived from delivered datagrams: repeated, changed, truncated, or sent to another node or to the
+The injected datagrams are delivered datagrams that are repeated, changed, truncated, or sent to another node or to the
 restarted node. The replies to injected datagrams are not delivered, so an injection changes only counters.
 """
 
@@ -154,7 +154,7 @@ class Wire(Workload):
         """Return a datagram for the node at ``own``: its kind, source and bytes."""
         rng, now = self._rng, self._schedule.team.clock.seconds()
         kind = rng.choice(KINDS)
-        if kind == "greeting":  # valid, but from an address that is not verified
+        if kind == "greeting":  # the datagram is valid, but its source address is not verified
             return kind, STRANGER, pack_discovery(derive_key(TEAM_KEY, b"greet"), rng.randbytes(TOKEN_BYTES), rng)
         source = rng.choice([STRANGER, None])
         place = own

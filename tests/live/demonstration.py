@@ -30,7 +30,8 @@ class Demonstration:
 
     def __init__(self, log: Path, *options: str, is_secure: bool = False) -> None:
         with log.open("w", encoding="utf-8") as errors:
-            # The page is the same for all kinds of robots; simulated dogs need the fewest resources.
+            # The page is the same for all kinds of robots, so the tests use simulated dogs, which need the fewest
+            # resources.
             command = [sys.executable, "-m", "sim.demo", "--robot", "sim", "--web-port", "0", *options]
             command += ["--tls"] if is_secure else []
             root = Path(__file__).parents[2]

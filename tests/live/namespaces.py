@@ -1,6 +1,7 @@
-"""A test case for network namespaces; without support for them its tests are skipped with a prominent message.
+"""A test case that needs network namespaces.
 
-With ``SWARM_CI=1`` missing support is a failure, because a skipped test proves nothing.
+If the machine does not support them, the tests are skipped with a prominent message. With ``SWARM_CI=1`` missing
+support is a failure, because a skipped test proves nothing.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from sim.namespaces.namespace import find_unavailable_reason
 
 
 class NamespaceCase(SynchronousTestCase):
-    """A test that needs namespaces."""
+    """A test that needs network namespaces."""
 
     def setUp(self) -> None:
         super().setUp()

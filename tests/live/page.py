@@ -1,8 +1,8 @@
 """Shared parts of the tests in a real browser: screens, the page's server as a child process, and opened pages.
 
-A browser, its driver and the program that serves teams start slowly, and ``trial -j`` distributes single tests, so a
-class fixture would be created for each test. They are therefore started once per process and reused; each test has its
-own browser context and team.
+A browser, its driver and the program that serves teams start slowly, so each process starts them once and reuses them.
+(A class fixture would be created for each test, because ``trial -j`` distributes single tests.) Each test has its own
+browser context and team.
 """
 
 from __future__ import annotations
@@ -88,10 +88,10 @@ def film(path: Path) -> Path:
 
 
 class Chromium:
-    """The browser's driver, and a browser whose camera plays a video; a context without permission has no camera.
+    """The browser's driver, and a browser with a fake camera that plays a video.
 
-    Between two calls the driver marks the thread as running an event loop. Other tests run their own loops, so the mark
-    is removed when no test uses the driver.
+    A browser context without permission has no camera. Between two calls the driver marks the thread as running an
+    event loop. Tests without a browser run their own event loops, so the mark is removed when no test uses the driver.
     """
 
     def __init__(self) -> None:
@@ -209,7 +209,7 @@ class BrowserCase(SynchronousTestCase):
         return browser
 
     def tab(self, screen: dict[str, Any], scheme: Any = "light", **more: Any) -> Any:
-        """Return an empty page on that screen, in a new session.
+        """Return an empty page on a screen of this kind, in a new session.
 
         The service worker would load all files again, so it is blocked unless ``service_workers="allow"`` is given.
         """
@@ -229,13 +229,13 @@ class BrowserCase(SynchronousTestCase):
         page.locator("#link[data-link=live]").wait_for()
 
     def live(self, page: Any, devices: int = 3) -> Any:
-        """Return the page when it shows this number of devices."""
+        """Wait until the page shows this number of devices, then return the page."""
         page.locator("#link[data-link=live]").wait_for()
         page.locator(".device").nth(devices - 1).wait_for(state="attached")
         return page
 
     def informed(self, page: Any) -> Any:
-        """Return the page when it has received the features of its node, on which its content depends."""
+        """Wait until the page has received its node's features, on which its content depends, then return the page."""
         page.evaluate(INFORMED)
         return page
 
@@ -250,7 +250,7 @@ class BrowserCase(SynchronousTestCase):
         return lambda x, y: (box["x"] + box["width"] * x / 3.0, box["y"] + box["height"] * (1 - y / 2.4))
 
     def pass_by(self, page: Any, seconds: float) -> None:
-        """Advance the page's clock; wait until the requests that this causes have been sent."""
+        """Advance the page's clock; wait until the page has sent all requests that are due by then."""
         page.clock.fast_forward(1000 * seconds)
         page.evaluate("fetch('/api/v1/node').then((told) => told.text())")
 

@@ -99,7 +99,7 @@ def beside(pictures: list[Picture]) -> Picture:
 
 
 def packed(picture: Picture) -> bytes:
-    """Return a PNG with the best palette, which k-means with a fixed seed finds."""
+    """Return a PNG with a palette that is chosen by k-means with a fixed seed."""
     cv2.setRNGSeed(1)
     found = picture.reshape(-1, 3).astype(np.float32)
     some = found[np.random.default_rng(1).integers(0, len(found), SAMPLED)]

@@ -1,6 +1,7 @@
 """A program that contains only a robot's driver, for tests that freeze and kill the program.
 
-Its arguments are a driver's kind and options (JSON); it executes commands from its input and prints the results.
+The arguments are a driver's kind and options (JSON). The program executes commands from its input and prints the
+results.
 """
 
 from __future__ import annotations

@@ -4,10 +4,15 @@
 a new team, in which vaio and pi accept each other's sessions; the reply contains the port, the join code, and an
 operator's token and ticket. ``end`` closes the page of the team. The other commands change the team:
 
-``gone NAME``, ``back NAME``, ``status NAME STATUS``, ``name NAME``: the name of the node that serves the page, ``pages
-NODE=URL ...``: the web nodes, starting with this node, ``strange FILE``: devices and tasks with the texts of this JSON
-list, ``session SECONDS``: the duration of a session, ``place NAME KEY=NUMBER ...``: the position that a device reports,
-``outdoors``: no simulator, ``crowd COUNT``: this number of devices, three of them with cameras.
+- ``gone NAME`` and ``back NAME`` let a device leave and return.
+- ``status NAME STATUS`` changes the status of a device.
+- ``name NAME`` changes the name of the node that serves the page.
+- ``pages NODE=URL ...`` sets the web nodes, starting with this node.
+- ``strange FILE`` creates devices and tasks with the texts of the JSON list in the file.
+- ``session SECONDS`` sets the duration of a session.
+- ``place NAME KEY=NUMBER ...`` sets the position that a device reports.
+- ``outdoors`` removes the simulator.
+- ``crowd COUNT`` creates devices until there are ``COUNT``, three of them with cameras.
 
 The program ends at the end of its input.
 """
@@ -80,7 +85,7 @@ def dog(number: int, status: str, task: str, started: float) -> dict[str, Any]:
 
 
 def why() -> dict[str, Any]:
-    """Return two decisions: the one for dog3 is followed by the one for dog2, which dog3 has not received."""
+    """Return two decisions: first a decision for dog3, then a decision for dog2 that dog3 has not received."""
     costs = {"dog2": 0.62, "dog1": 1.04, "dog3": 1.37}
     reports = [{"agent": f"0{name[-1]}" * 16, "name": name, "cost": cost, "more": ""} for name, cost in costs.items()]
     first = {
@@ -181,7 +186,7 @@ class Team:
         return {**state, "halted": self.stop_control.is_halted()}
 
     def be_strange(self, words: list[str]) -> None:
-        """For each of ``words``, create a device, a task and a decision that have it in every text field."""
+        """For each text in ``words``, create a device, a task and a decision with this text in every text field."""
         now = time.time()
         self.batch += 1
         self.devices, self.tasks = [], []
@@ -283,7 +288,7 @@ class Orders(LineReceiver):
     _pages: list[Page]
 
     def lineReceived(self, line: bytes) -> None:
-        """Execute one command; reply to it, so the test knows when it has been executed."""
+        """Execute one command and reply, so the test knows when the command has been executed."""
         verb, *rest = line.decode().split()
         if verb == "team":
             self._begin(int(rest[0]))

@@ -11,7 +11,7 @@ class ActionPageTests(PageCase):
     timeout = 170
 
     def test_stop_from_everywhere(self) -> None:
-        """One touch stops the team from any scroll position and dialog; another touch releases it."""
+        """At any scroll position and in any dialog, one touch stops the team and another touch releases it."""
         page = self.opened(PHONE)
         corner = page.locator(".stop").bounding_box()
         page.locator(".stop").tap()
@@ -51,7 +51,10 @@ class ActionPageTests(PageCase):
         self.told(page, TEXTS["stop.released"])
 
     def test_ask_before_assigning(self) -> None:
-        """Before a task is assigned, the page lists the devices that can execute it, and the reasons of all others."""
+        """Before a task is assigned, the page lists the devices that can execute it.
+
+        For every other device, the page states the reason why the device cannot execute the task.
+        """
         page = self.opened(PHONE)
         self.view(page, "tasks")
         page.locator(".preview [data-can=can]", has_text="dog1, dog2 (now: Patrol the yard)").wait_for()
@@ -90,7 +93,7 @@ class ActionPageTests(PageCase):
     def test_lift_a_robot(self) -> None:
         """A robot is moved by dragging and with arrow keys, and turned by a click or Enter.
 
-        The target does not move.
+        The target is not moved by these actions.
         """
         page = self.opened(DESK)
         at = self.floor(page)

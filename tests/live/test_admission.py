@@ -1,4 +1,4 @@
-"""Tests of a closed team of real processes: it is created, joined with a code over UDP, and left."""
+"""Tests of a closed team of real processes: a second node joins it by code over UDP and is later revoked."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from tests.live.node import PATIENCE_S, NodeCase
 
 class ClosedTeamTests(NodeCase):
     def told(self, *words: str, code: int = 0) -> Any:
-        """Return the result of ``swarm WORDS --json``, or the error output if it fails with ``code``."""
+        """Return the result of ``swarm WORDS --json``, or its error output if it fails with the exit code ``code``."""
         done = self.swarm(*words, "--json")
         self.assertEqual(done.returncode, code, done.stderr)
         return json.loads(done.stdout) if code == 0 else done.stderr
 
     def test_made_joined_and_left(self) -> None:
-        """Four commands create a team of two; a used code and a revoked member are refused with the reason."""
+        """Four commands create a team of two; a used join code and a revoked member are refused with the reason."""
         [port] = find_free_ports("udp", "127.0.0.1", 1)
         team = self.told("init", "yard", "--first", "vaio", "--at", f"127.0.0.1:{port}")
         self.node("--config", team["settings"]).says("vaio joined")

@@ -69,7 +69,7 @@ class AmplificationTests(NamespaceCase):
             # Some replies have arrived, so the comparison is meaningful.
             self.assertGreater(traffic.sent, 0)
             self.assertLessEqual(traffic.amplification, 1.0)
-            # Each datagram has its own port, so the bytes of one request cannot count for the reply to another.
+            # Each datagram has its own source port, so the reply to it is compared only with its own length.
             for peer, each in seen.traffic.items():
                 if peer.startswith(net.address("stranger1") + ":"):
                     self.assertLessEqual(each.amplification, 1.0)

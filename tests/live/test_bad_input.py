@@ -49,7 +49,7 @@ class BadInputTests(NodeCase):
             self.assert_says(line, path, key, str(port), "choose another port, or 0")
 
     def test_address_of_another_machine(self) -> None:
-        """An address of another machine is reported with the file; the remedy is not a different port."""
+        """An address of another machine is reported with the file; the stated remedy is not a different port."""
         for text, key in (
             ('[node]\nname = "a"\nteam_key = "t"\nhost = "192.0.2.1"\n', "[node]"),
             ('[node]\nname = "a"\nteam_key = "t"\nroles = ["web"]\n[web]\nhost = "192.0.2.1"\nport = 0\n', "[web]"),
@@ -64,7 +64,7 @@ class UnreachableBootstrapTests(NodeCase):
     """A missing bootstrap node is not an error."""
 
     def test_unreachable_bootstrap_is_tried_again(self) -> None:
-        """If its bootstrap node does not reply, a node logs this and retries; it ends within 2 s after SIGTERM."""
+        """A node whose bootstrap node does not reply logs this and retries; it ends within 2 s after SIGTERM."""
         with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as silent:
             silent.bind(("127.0.0.1", 0))
             port = silent.getsockname()[1]

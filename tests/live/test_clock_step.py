@@ -1,4 +1,4 @@
-"""Tests of a running node when the wall clock is set: no timer, lease or TTL changes (invariant R5)."""
+"""Tests that setting the wall clock changes no timer, lease or TTL of a running node (invariant R5)."""
 
 from __future__ import annotations
 

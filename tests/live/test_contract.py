@@ -51,7 +51,7 @@ class ContractTests(TeamCase):
         self.assertGreater(int(counts[1]), 400)
 
     def document(self) -> Any:
-        """Return the node's document; ``KNOWN`` fields get names that exist and names that do not."""
+        """Return the node's OpenAPI document; for ``KNOWN`` fields it allows existing and non-existing names."""
         address = f"{self.team.url}api/v1/openapi.json?ticket={self.team.ticket}"
         with urllib.request.urlopen(address, timeout=10) as answer:
             document = json.load(answer)

@@ -32,7 +32,7 @@ CHANGE = """async () => {
 
 class CrowdTests(PageCase):
     def test_show_two_thousand(self) -> None:
-        """Two thousand devices are shown in time, a change of one is shown quickly, and a filter finds some devices."""
+        """Two thousand devices are shown in time, a change of a device is shown quickly, and the filter works."""
         self.team.order(f"crowd {COUNT}")
         for screen in (PHONE, DESK):
             page = self.tab(screen)

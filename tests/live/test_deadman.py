@@ -96,7 +96,7 @@ class Puppeteer:
             )
 
     async def said(self, word: str, count: int = 1) -> list[str]:
-        """Wait until ``count`` lines start with this word; return the rest of the last of them."""
+        """Wait until ``count`` lines start with this word; return the last of these lines without the word."""
         found: list[list[str]] = []
 
         def is_said() -> bool:
@@ -249,7 +249,7 @@ class KeeperTests(TestCase):
         self.wire.is_busy = False
 
     async def test_lets_go_of_the_link(self) -> None:
-        """When the driver releases and closes a link, it is closed at the robot's end as well."""
+        """When the driver closes a link and the switch releases it, the link is also closed at the robot's end."""
         self.keeper.set_halt_command(HaltCommand(b"halt", self.wire))
         await wait(0.1)
         self.wire.near.close()
@@ -295,7 +295,7 @@ class KeeperTests(TestCase):
         await until(lambda: self.wire.heard() == b"halt", 1.0)
 
     async def test_names_what_cannot_be_started(self) -> None:
-        """If no switch can be started, or each switch ends immediately, this is logged once and retried."""
+        """If no switch can be started, or each switch ends immediately, the keeper logs this once and retries."""
         for program, words in (
             ("/nowhere/python", "dead man's switch did not start"),
             ("/bin/false", "restarting it"),
@@ -319,7 +319,7 @@ class KeeperTests(TestCase):
             self.wire.heard()
 
     async def test_ends_at_any_moment(self) -> None:
-        """A keeper leaves no process, whether it is closed before, during or after a start, once or twice."""
+        """A keeper leaves no process running, whether it is closed before, during or after a start, once or twice."""
         for stage in range(4):
             keeper = Supervisor("robot", reactor)
             if stage:
@@ -356,7 +356,7 @@ class AiboDeadManTests(DeadManCase):
         await self.server.stop()
 
     async def test_frozen(self) -> None:
-        """If the program is stopped (SIGSTOP), the dog stops after its deadline, until it gets a new permit."""
+        """If the program is stopped (SIGSTOP), the dog stops after the deadline, and stands until a new permit."""
         await self.freeze(await self.driven("aibo", **self.options))
 
     async def test_killed(self) -> None:

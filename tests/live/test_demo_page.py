@@ -130,7 +130,7 @@ class DemonstrationPageTests(DemonstrationPageCase):
         page.locator(".device[data-state=SEARCHING]").first.wait_for()
         views = [page.evaluate(SMALL, index) for index in range(3)]
         for index, before in enumerate(views):
-            for _ in range(40):  # a dog may see almost the same for some time
+            for _ in range(40):  # the view of a dog may be almost constant for some time
                 page.wait_for_timeout(250)
                 differ = sum(abs(a - b) for a, b in zip(before, page.evaluate(SMALL, index), strict=True)) / len(before)
                 if differ > MOVED:

@@ -56,7 +56,7 @@ class DeployTests(NamespaceCase):
         self.nodes: dict[str, subprocess.Popen[bytes]] = {}
 
     def blocks(self, first: str, last: str) -> Iterator[Block]:
-        """Yield computer, whether its node is stopped first, and lines, for each block between two headings."""
+        """For each block between two headings, yield the computer, whether its node is stopped first, and the lines."""
         text = PAGE.read_text(encoding="utf-8")
         part = text[text.index(f"## {first}") : text.index(f"## {last}") if last else len(text)]
         for name, again, lines in BLOCK.findall(part):
@@ -96,7 +96,7 @@ class DeployTests(NamespaceCase):
         return said
 
     def meant(self, line: str, name: str, net: Internet) -> str:
-        """Return a line of the page with the real code and addresses filled in."""
+        """Return a line of the page in which the code and addresses are replaced by the real ones."""
         if "swarm join " in line:
             line = CODE.sub(self.codes[name], line)
         if "w1" in net.hosts:
@@ -129,7 +129,10 @@ class DeployTests(NamespaceCase):
         return "\n".join(f"-- {path.parent.name}\n{path.read_text()}" for path in self.folder.glob("*/log"))
 
     def test_three_laptops(self) -> None:
-        """With the page's lines three laptops behind one router form a team, and one opens the web page of another."""
+        """With the lines of the documentation page, three laptops behind one router form a team.
+
+        One laptop opens the web page of another laptop.
+        """
         with Internet([Site("w", NatKind.PORT, hosts=3)]) as net:
             places = {"vaio": "w1", "dog1": "w2", "dog2": "w3"}
             said = self.follow(net, places, self.blocks("Three laptops on one Wi-Fi", "Over the internet"))
@@ -141,7 +144,7 @@ class DeployTests(NamespaceCase):
             self.assertEqual(self.run_line(net, "w2", "dog1", command).strip(), "200")
 
     def test_over_the_internet(self) -> None:
-        """The page's lines work for a rented computer with a firewall and laptops behind routers.
+        """The lines of the documentation page work for a rented computer with a firewall and laptops behind routers.
 
         One of the laptops has no UDP.
         """
@@ -151,7 +154,7 @@ class DeployTests(NamespaceCase):
             places = {"boss": "o1", "host1": PUBLIC_HOST, "cam1": "h1", "cam2": "u1"}
             making, *rest = self.blocks("Over the internet", "")
             self.follow(net, places, [making])
-            for ending in ("toml", "membership"):  # the page uses scp here
+            for ending in ("toml", "membership"):  # the documentation page uses scp here
                 shutil.move(self.home("boss") / f"host1.{ending}", self.home("host1"))
             said = self.follow(net, places, rest)
             gone = self.home("cam2") / "log"

@@ -72,7 +72,7 @@ class DoctorCase(NamespaceCase):
         return process
 
     def home(self, settings: Path) -> Path:
-        """Return the folder of a node's control socket; it depends on the host, because the hosts share one disk."""
+        """Return the folder of a node's control socket; each host has its own, because the hosts share one disk."""
         home = Path("/tmp") / f"doctor-{abs(hash((str(self.folder), settings.stem))) % 10**9}"
         if not home.exists():
             home.mkdir(mode=0o700)
@@ -137,7 +137,7 @@ class LanTests(DoctorCase):
         self.own = self.settings("own", net.address("a1"), [self.other])
 
     def test_well(self) -> None:
-        """Two nodes without known nodes find each other; the doctor finds no cause, and the link is good."""
+        """Two nodes with no known nodes in their settings find each other; the doctor finds no problem."""
         settings = self.settings("own", self.net.address("a1"))
         self.node("a1", settings)
         said = self.asked("a1", settings)
@@ -200,7 +200,7 @@ class LanTests(DoctorCase):
         self.assertEqual(self.causes("a1", settings), ["version-skew"])
 
     def test_machine(self) -> None:
-        """A port in use, an impossible store and settings that others can read are reported together."""
+        """A port in use, an unusable store, and settings that other users can read are reported together."""
         settings = self.settings("taken", self.net.address("a2"), [], store="nowhere/a.sqlite", lan=False)
         settings.chmod(0o644)
         self.assertEqual(self.causes("a2", settings), ["port-in-use", "store-unwritable", "key-readable"])

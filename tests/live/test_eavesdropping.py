@@ -90,7 +90,7 @@ class EavesdroppingTests(TestCase):
 
     @inlineCallbacks
     def test_nothing_is_readable(self) -> Generator[Deferred[Any], Any, None]:
-        """No name, task, position, message, key, certificate or secret is readable; only public data is."""
+        """No name, task, position, message, key, certificate or secret can be read in the captured datagrams."""
         dice = random.SystemRandom()
         signer = create_operator("kennel", dice)
         first = signer.create_membership("hedgehog", ("device", "bootstrap", "gateway"), time.time(), dice)

@@ -73,7 +73,7 @@ class ExamplesTests(TestCase):
         self.assertEqual(self.line(self.start("keyvalue", free_port(), known, "colour")), "red")
 
     def test_chat(self) -> None:
-        """Each of two chats prints the lines of the other, without control characters."""
+        """Each of two chat programs prints the lines of the other program, without control characters."""
         first = free_port()
         ann = self.start("chat", "--port", first, "ann")
         self.assertEqual(self.line(ann), "here: ann")

@@ -78,7 +78,7 @@ class FallbackTests(BrowserCase):
         self.served("pi")
 
     def test_go_past_an_impostor(self) -> None:
-        """A listed web node that is not a gateway gets no requests and no token, and no URL contains a token."""
+        """A listed web node without the role gateway gets no requests and no token; no URL contains a token."""
         eve = Team()
         self.addCleanup(eve.end)
         eve.order("name eve")
@@ -119,7 +119,7 @@ class FallbackTests(BrowserCase):
         self.assertEqual((len(keys), len(set(keys))), (2, 1))
 
     def test_keep_all_or_nothing(self) -> None:
-        """The page is cached as a whole: with a single cached file it would open without the other files."""
+        """The page is cached as a whole, because with a single cached file it would open without the other files."""
         self.opened()
         self.page.evaluate(KEPT)
         held = "async () => (await (await caches.open('swarm.shell')).keys()).length"

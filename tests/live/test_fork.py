@@ -36,12 +36,12 @@ class ForkTests(SynchronousTestCase):
             run_in_fork(lambda: int("none"), ValueError)
 
     def test_ends_without_a_word(self) -> None:
-        """A child process that ends without a result raises an error that contains the exit code."""
+        """If a child process ends without a result, the call raises an error that contains the exit code."""
         with self.assertRaisesRegex(RuntimeError, "exit code 7"):
             run_in_fork(lambda: os._exit(7))
 
     def test_ended_with_who_waits_for_it(self) -> None:
-        """If the waiting parent is interrupted, the call is interrupted too, and its exception reaches the parent."""
+        """If the waiting parent is interrupted, the child is interrupted too, and its exception reaches the parent."""
         ready, told = os.pipe()
         self.addCleanup(os.close, ready)
         self.addCleanup(os.close, told)

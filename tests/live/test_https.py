@@ -64,7 +64,7 @@ class HttpsTests(NodeCase):
         return trust
 
     def test_serve_the_page_to_who_trusts_it(self) -> None:
-        """One node serves the whole page over TLS, applies the plain port's checks, and closes slow handshakes."""
+        """A node serves the whole page over TLS, with the same checks as over HTTP, and closes slow handshakes."""
         node = SecureNode(self, "vaio")
         self.serve_all_of_the_page(node)
         self.keep_the_guard(node)
@@ -99,7 +99,7 @@ class HttpsTests(NodeCase):
         self.assertIn(b"vaio", asked(node.secure, self.trusting(node, maximum_version=ssl.TLSVersion.TLSv1_2)))
 
     def keep_the_guard(self, node: SecureNode) -> None:
-        """Check that requests that the plain port refuses, such as for another host, are also refused over TLS."""
+        """Check that requests that the HTTP port refuses, such as requests for another host, are refused over TLS."""
         trust = self.trusting(node)
         for path, headers, body, status in (
             ("/api/v1/state", {}, None, 401),

@@ -38,7 +38,7 @@ class InviteTests(PageCase):
         return str(cv2.QRCodeDetector().detectAndDecode(picture)[0])
 
     def another(self, page: Any) -> None:
-        """Request a new invitation, because OpenCV's reader fails for one code in a hundred."""
+        """Request a new invitation; this is needed because OpenCV's reader fails for one QR code in a hundred."""
         before = page.locator("#i-link").input_value()
         for kind in ("viewer", "phone"):
             page.locator("#i-kind").select_option(kind)

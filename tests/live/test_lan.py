@@ -60,7 +60,7 @@ class LoopbackTests(TestCase):
         self.assertEqual(heard_a[1], (b"here", Address("127.0.0.1", answering.getHost().port)))
 
     async def test_a_change_is_told(self) -> None:
-        """A change of the interfaces is reported, but not the first list of interfaces."""
+        """A change of the network interfaces is reported; the first list of interfaces is not reported as a change."""
         loopback = Interface(1, "lo", ("127.0.0.1",), is_loopback=True)
         found = [[loopback], [loopback], [Interface(1, "lo", ("127.0.0.1", "::1"), is_loopback=True)]]
         changes: list[int] = []

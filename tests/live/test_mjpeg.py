@@ -1,4 +1,7 @@
-"""Tests of camera streams over real sockets: the driver with a different server, the emulator with OpenCV's client."""
+"""Tests of camera streams over real sockets.
+
+The driver reads the stream of a server that is not the emulator; OpenCV's client reads the stream of the emulator.
+"""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ class InternetTests(NamespaceCase):
     """Behaviour of ``Internet``."""
 
     def seen(self, net: Internet, host: str) -> list[tuple[str, int] | None]:
-        """Return the addresses at which three echo servers on the public host see one socket of ``host``."""
+        """Return the source addresses that three echo servers on the public host see for one socket of ``host``."""
         done = net.run(host, [sys.executable, "-c", ASK, *TARGETS], timeout=LIMIT_S)
         self.assertEqual(done.returncode, 0, done.stderr)
         found: list[tuple[str, int] | None] = json.loads(
@@ -64,7 +64,7 @@ class InternetTests(NamespaceCase):
         self.assertEqual(process.stdout.readline(), "ready\n")
 
     def test_mappings_are_of_their_kind(self) -> None:
-        """Each kind of router maps a socket to one external port for all peers, to one per peer, or to none."""
+        """Depending on its kind, a router maps a socket to one port for all peers, to one port per peer, or to none."""
         kinds = list(NatKind)
         net = self.internet(*(Site(kind.value, kind) for kind in kinds))
         self.echo(net)

@@ -45,7 +45,10 @@ class PageTests(PageCase):
         return list(page.locator(".device b").all_inner_texts())
 
     def test_reach_each_view(self) -> None:
-        """On a phone at most two taps open any view, alone on the screen; keys, back and links open it as well."""
+        """On a phone at most two taps open any view, which then fills the screen.
+
+        Keys, the browser's back button and links open views as well.
+        """
         page = self.opened(PHONE)
         shown = "[...document.querySelectorAll('main section, footer')].filter(e => e.checkVisibility()).map(e => e.id)"
         for name, links in {
@@ -94,7 +97,7 @@ class PageTests(PageCase):
         self.assertEqual((page.evaluate(dark), page.locator("#theme").input_value()), (chosen, "dark"))
 
     def test_fill_a_wall(self) -> None:
-        """A large screen shows all views simultaneously, or one of them in full size."""
+        """A large screen shows all views simultaneously, or a single view in full size."""
         page = self.opened({"viewport": {"width": 2560, "height": 1440}})
         heights = page.evaluate("[...document.querySelectorAll('main section')].map(e => e.getBoundingClientRect())")
         self.assertEqual(len([box for box in heights if box["top"] < 1440]), 7)
@@ -104,7 +107,10 @@ class PageTests(PageCase):
         self.assertGreater(page.locator("canvas").first.bounding_box()["width"], 600)
 
     def test_ask_devices(self) -> None:
-        """The network is queried only while its view is shown, the storage of a device when its dialog opens."""
+        """The page queries the network only while the network view is shown.
+
+        It queries the storage of a device when the dialog of the device opens.
+        """
         page = self.opened(PHONE, has_clock=True)
 
         def asks() -> bool:
@@ -128,9 +134,9 @@ class PageTests(PageCase):
         self.assertFalse(asks())
 
     def test_tell_why(self) -> None:
-        """A task lists agents that agree and agents that differ.
+        """For each task the page lists the agents that agree on the decision and the agents that differ.
 
-        Its details show the rule and reports of each decision.
+        The details show the rule and the reports of each decision.
         """
         for screen in (PHONE, DESK):
             page = self.opened(screen)
@@ -153,7 +159,10 @@ class PageTests(PageCase):
             self.team.order("status dog1 WAITING")
 
     def test_show_cameras(self) -> None:
-        """A desktop shows three live cameras; the camera of an absent device, or out of view, is not requested."""
+        """A desktop shows three live cameras.
+
+        The pictures of a camera are not requested if its device is absent or if the camera is scrolled out of view.
+        """
         page = self.opened(DESK)
         page.locator("figure[data-camera=live]").nth(2).wait_for()
         self.team.order("gone dog2")
@@ -173,7 +182,10 @@ class PageTests(PageCase):
         phone.locator("figure[data-camera=live]").first.wait_for()
 
     def test_show_who_left(self) -> None:
-        """A device that leaves stays at its place as gone, with the time since then, and returns automatically."""
+        """A device that leaves stays in the list and is marked as gone, with the time since it left.
+
+        When the device returns, the mark disappears automatically.
+        """
         page = self.opened(DESK)
         self.assertEqual(self.names(page), ["dog1", "dog2", "dog3"])
         self.team.order("gone dog1")
@@ -185,7 +197,10 @@ class PageTests(PageCase):
         page.locator(".device[data-state=WAITING]", has_text="dog1").wait_for()
 
     def test_open_a_device(self) -> None:
-        """A double click, Enter and its URL open a device, a single click does not; Escape, Close and back close it."""
+        """A double click, the key Enter or the URL of a device opens its dialog; a single click does not.
+
+        Escape, the button Close and the browser's back button close the dialog.
+        """
         page = self.opened(DESK)
         dialog = page.locator("dialog[open]")
         page.locator(".device").nth(1).click()
@@ -220,7 +235,10 @@ class PageTests(PageCase):
         self.assertEqual(self.faults, [])
 
     def test_run_the_parts_of_the_page(self) -> None:
-        """A panel appears at its place for its roles, gets events, and ends; rows with equal content are kept apart."""
+        """A panel is shown at its position to the permitted roles, receives events, and is removed.
+
+        Rows with equal content stay separate rows.
+        """
         page = self.informed(self.opened(DESK))
         self.assertEqual(page.evaluate(TWINS), [["abab", 4], ["aba", 0], ["baa", 0]])
         page.evaluate(PANELS)
@@ -238,7 +256,7 @@ class PageTests(PageCase):
         page.locator(".device[data-state=DONE]", has_text="dog3").wait_for()
 
     def test_tell_what_happened(self) -> None:
-        """Events are listed as text, newest first: all events, or only the events of one kind, device or task."""
+        """Events are listed as text, newest first; a filter selects the events of one kind, device or task."""
         page = self.opened(DESK)
         story = page.locator("#events li")
         page.locator("#events li", has_text="starts to observe").wait_for()
@@ -281,7 +299,7 @@ class PageTests(PageCase):
         self.assertEqual(len(set(shapes)), 3)
         self.team.order("status dog3 DONE")
         page.locator(".device[data-state=DONE]", has_text="done").wait_for()
-        # If the events fill the screen, the page is scrolled, not a list within it.
+        # If the events fill the screen, the user scrolls the page, not a list within the page.
         self.view(page, "events")
         page.locator("#events li", has_text="starts to observe").wait_for()
         inside = """events => {

@@ -21,7 +21,7 @@ class LanguageTests(PageCase):
         return self.informed(self.live(page))
 
     def test_choose_the_language(self) -> None:
-        """A German browser shows German texts and numbers, and translated API codes; a French one shows English."""
+        """A German browser shows German texts and numbers, and translated API codes; a French browser shows English."""
         for locale, language, metres in (("de-DE", "de", "0,62 m"), ("fr-FR", "en", "0.62 m")):
             page = self.opened_in(locale)
             texts = catalogue(language)
@@ -37,7 +37,7 @@ class LanguageTests(PageCase):
             page.context.close()
 
     def test_fit(self) -> None:
-        """In German nothing is cut off in any view or dialog, and no view shows a key or a placeholder."""
+        """In German, no text is cut off in any view or dialog, and no view shows a text key or a placeholder."""
         for screen in (PHONE, {"viewport": {"width": 390, "height": 844}}, DESK):
             page = self.opened_in("de-DE", screen)
             for view in VIEWS:

@@ -1,4 +1,4 @@
-"""Tests of a robot on a serial port that has a network camera and a compass: one device in the settings file."""
+"""Tests of one device that consists of a robot on a serial port, a network camera and a compass."""
 
 from __future__ import annotations
 
@@ -36,7 +36,10 @@ class LivePartsTests(TestCase):
 
     @inlineCallbacks
     def test_is_one_device(self) -> Generator[Deferred[Any], Any, None]:
-        """Each part has its own kind of link; the camera is lost and reconnects while the robot drives."""
+        """Robot, camera and compass have different kinds of links.
+
+        The camera is lost and reconnects while the robot drives.
+        """
         body = MemoryRobot(jpeg=jpeg(5), values={"compass.heading": 0.5})
         robot, camera, compass = (
             Create2(body, reactor, Random(1)),

@@ -172,7 +172,7 @@ class DemonstrationPhoneTests(BrowserCase, DemonstrationCase):
         self.fail("there is no place for the target")
 
     def joined(self) -> Any:
-        """Return the page of a phone that takes part as anna, with the target in view of its camera."""
+        """Return the page of a phone that joined the team as "anna", with the target in view of its camera."""
         invitation = self.demo.api("invitations", {"role": "phone", "name": "visitor"})["token"]
         self.until(lambda: {"dog1", "dog2", "dog3"} <= set(self.devices()))
         self.until(lambda: len(self.demo.api("node")["pages"]) == (4 if self.is_secure else 2))

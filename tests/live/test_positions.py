@@ -52,7 +52,7 @@ class PositionTests(PageCase):
             page = self.opened(screen, scheme)
             self.view(page, "map")
             page.locator("#position-map .spot").nth(1).wait_for()
-            # The drawing is to scale after the page has received all three positions.
+            # The scale is final only after the page has received all three positions.
             page.locator("#place-map", has_text="north is up. 1 more device uses another frame").wait_for()
             one, two = self.centres(page, "dog1", "dog2")
             # 22.3 m to the east and 11.1 m to the north

@@ -1,4 +1,4 @@
-"""Tests of strategies from other distributions in real processes."""
+"""Tests of strategies from other Python packages, each in its own real process."""
 
 from __future__ import annotations
 
@@ -104,9 +104,9 @@ class ProcessStrategyTests(SynchronousTestCase):
         self.assertEqual(self.flushLoggedErrors(), [])
 
     def test_group(self) -> None:
-        """A strategy for groups gives the same results in its process.
+        """A strategy for groups of tasks gives the same results in a separate process.
 
-        A strategy for single tasks is called per task.
+        A strategy for single tasks is called once per task.
         """
         items = [Item("s", (1.0, 2.0)), Item("t")]
         bids = [Report(a, c, task=t) for a, c in (("a", 1.0), ("b", 2.0)) for t in "st"]
@@ -115,7 +115,7 @@ class ProcessStrategyTests(SynchronousTestCase):
         self.assertEqual(self.flushLoggedErrors(), [])
 
     def test_looping(self) -> None:
-        """A strategy that never replies costs its deadline three times; then it is not called, and its process ends."""
+        """After a strategy has missed its deadline three times, it is no longer called, and its process ends."""
         guard = self.guard("Looping", DEADLINE_S)
         worst = 0.0
         end = time.monotonic() + PATIENCE

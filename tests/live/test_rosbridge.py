@@ -1,4 +1,7 @@
-"""Tests of the rosbridge driver over real TCP and with another server, and of its emulator with another client."""
+"""Tests of the rosbridge driver over real TCP.
+
+The driver is also tested with another WebSocket server than its emulator, and the emulator with the client roslibpy.
+"""
 
 from __future__ import annotations
 

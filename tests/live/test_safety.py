@@ -51,7 +51,7 @@ class SafetyTests(TeamCase):
         return self._key.sign_token(claim.ticket if ticket else claim)
 
     def asked(self, method: str, path: str, body: bytes | None = None, **headers: str) -> Answer:
-        """Send one request on a new connection; from a stream, read only the headers."""
+        """Send one request on a new connection and return the response; of a stream, read only the headers."""
         given = {name.replace("_", "-"): value for name, value in headers.items()}
         connection = http.client.HTTPConnection("127.0.0.1", self.team.port, timeout=10)
         try:
@@ -68,7 +68,7 @@ class SafetyTests(TeamCase):
         return {"Authorization": f"Bearer {token}"} if token else {}
 
     def test_let_in_whom_the_table_says(self) -> None:
-        """Each route accepts tokens of the roles in its row of the table, and rejects all others with 401 or 403.
+        """Each route accepts tokens of the roles that the table permits, and rejects all other tokens with 401 or 403.
 
         Every response has all security headers and does not identify the server.
         """

@@ -1,4 +1,4 @@
-"""Tests with two hundred scripts as names, tasks and messages: the page shows each script as text and runs none."""
+"""Tests that the page shows scripts as text and runs none; 200 scripts are used as names, tasks and messages."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ class ScriptTests(PageCase):
         )
 
     def test_notice_what_would_run(self) -> None:
-        """The test can detect a script: the CSP reports markup that is inserted into the page."""
+        """The test above would notice a script that runs: the browser reports inserted markup as a CSP violation."""
         self.page.goto(f"{self.team.url}#code={self.team.code}")
         self.page.locator(".device").first.wait_for()
         self.page.evaluate("document.body.insertAdjacentHTML('beforeend', '<img src=x onerror=ran()>')")

@@ -51,7 +51,10 @@ class Create2PtyTests(TestCase):
         return driver
 
     async def test_outlives_a_pulled_cable(self) -> None:
-        """With an unplugged cable the driver is stale and reports the missing device; with the cable, it is ready."""
+        """When the cable is unplugged, the driver is stale and reports the missing device.
+
+        When the cable is plugged in, the driver is ready again.
+        """
         driver = self.driver()
         await driver.connect()
         await driver.enable()

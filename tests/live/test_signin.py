@@ -1,4 +1,4 @@
-"""Tests of signing in to the page in a real browser: by link, by hand, as a viewer, and signing out."""
+"""Tests of signing in (by link, by hand and as a viewer) and signing out, on the page in a real browser."""
 
 from __future__ import annotations
 

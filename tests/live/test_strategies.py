@@ -1,4 +1,4 @@
-"""Tests that a team leaves no process if it uses strategies from other distributions."""
+"""Tests that no process is left running when a team that used strategies from other Python packages has ended."""
 
 from __future__ import annotations
 
@@ -60,9 +60,9 @@ class StrategiesTests(SynchronousTestCase):
         return sum(process.poll() is None for process in self.processes)
 
     def test_node_has_one_process_and_ends_it(self) -> None:
-        """Each node has one process for all tasks of a strategy; it ends with the node, even if the node crashes."""
+        """Each node has one process per strategy for all tasks; this process ends with the node, even after a crash."""
         team = SimulatedTeam(11, dogs=("dog1", "dog2"))
-        self.addCleanup(self.flushLoggedErrors)  # a strategy that is still loading is logged
+        self.addCleanup(self.flushLoggedErrors)  # the node logs an error while the strategy is still loading
         self.addCleanup(team.stop)
         self.submit(team, "t1")
         self.submit(team, "t2")
@@ -76,7 +76,10 @@ class StrategiesTests(SynchronousTestCase):
         self.assertEqual(self.alive, 0)
 
     def test_nothing_begins_after_the_end(self) -> None:
-        """After the end of a node, a strategy from another distribution is refused or replaced by the fallback."""
+        """After the end of a node, a strategy from another package starts no process.
+
+        The strategy is refused, or replaced by the fallback.
+        """
         early, late = StrategyRegistry(), StrategyRegistry()
         guard = early.get("spare", {})
         self.assertIs(early.get("spare", {}), guard)

@@ -303,7 +303,7 @@ class NodeTests(NodeCase):
         return child
 
     def test_enter_without_udp(self) -> None:
-        """A real node whose known node does not reply over UDP joins over TLS."""
+        """If its known node does not reply over UDP, a real node joins the team over TLS."""
         (number,) = free_ports.find_free_ports("tcp", HOST, 1)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as silent:
             silent.bind((HOST, 0))

@@ -61,7 +61,10 @@ class UdpTests(TestCase):
         self.assertNotIn("\n", str(error))
 
     def test_what_cannot_be_sent_is_counted(self) -> None:
-        """Invalid addresses, too large datagrams and a closed port raise no exception, and are counted."""
+        """Datagrams to invalid addresses, too large ones, and datagrams at a closed port are counted.
+
+        They raise no exception.
+        """
         network = self.network()
         network.send(b"x", Address("127.0.0.1", 9))
         network.listen(lambda datagram, source: None)
@@ -88,7 +91,10 @@ class UdpTests(TestCase):
 
     @inlineCallbacks
     def test_further_ports(self) -> Generator[Deferred[Any], Any, None]:
-        """A peer can be assigned to an additional port; an unknown sender gets its reply from the port that it used."""
+        """Datagrams to a peer can be sent from an additional port.
+
+        An unknown sender gets its reply from the port to which it sent.
+        """
         one, other = self.network(), self.network()
         heard: list[Address] = []
         arrived: Deferred[None] = Deferred()

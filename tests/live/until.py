@@ -14,7 +14,10 @@ PATIENCE_S = 120.0
 
 
 def until(is_so: Callable[[], T], within: float = PATIENCE_S, told: Callable[[], object] = str) -> T:
-    """Return the value of ``is_so`` when it is true; after ``within`` seconds fail with the text of ``told``."""
+    """Wait until ``is_so`` returns a true value, and return this value.
+
+    After ``within`` seconds fail with the text that ``told`` returns.
+    """
     end = time.monotonic() + within
     while not (found := is_so()):
         if time.monotonic() > end:
