@@ -273,8 +273,8 @@ class AuctionSimulation:
         def contacts() -> list[Contact]:
             if not known:
                 table = self.ring.make_table(place)
-                # Ten thousand full tables do not fit into memory; only flooding needs more contacts than the path to
-                # the key.
+                # Ten thousand full routing tables do not fit into memory.  Each node therefore knows only the
+                # contacts on its path to the key; only flooding needs all of them.
                 everybody = table.list_contacts()
                 known.extend(select_closest(everybody, self.auction.key, K) if self.auction.exclusive else everybody)
             return known

@@ -83,7 +83,7 @@ class CertificateProvider:
     def serverConnectionForTLS(self, protocol: object) -> Connection:  # noqa: N802
         """Return the TLS state of the next connection."""
         now = self._wall()
-        # Also check again if the clock was set back.
+        # A clock that was set back is another reason to repeat the check.
         if not 0.0 <= now - self._checked_at < CHECK_S:
             self._checked_at = now
             flaw = self._leaf.find_flaw(self._signer, self._required_names(), now)

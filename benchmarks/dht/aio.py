@@ -10,7 +10,7 @@ from benchmarks.dht.library import Cancel, OnDone, OnValue
 
 
 class AsyncioPeer:
-    """A node that runs in an asyncio loop; a library's own threads use ``call_soon``."""
+    """A node that runs in an asyncio loop; threads of the measured library call the loop by ``self.call_soon``."""
 
     def __init__(self, folder: str) -> None:
         self._tasks: set[asyncio.Task[Any]] = set()

@@ -120,7 +120,7 @@ class Invite(Entry):
 
     @property
     def kept_until(self) -> int:
-        """A week after the end date; until then the code is refused as expired."""
+        """The end of storage, a week after the end date: until then the code is refused as expired."""
         return self.not_after + INVITATION_REMEMBERED_S
 
     def allows(self, name: str, requested_name: str) -> bool:
@@ -142,7 +142,7 @@ class Terms(Entry):
 
     @property
     def kept_until(self) -> int:
-        """A week after the end date; until then the code is refused as expired."""
+        """The end of storage, a week after the end date: until then the code is refused as expired."""
         return self.not_after + INVITATION_REMEMBERED_S
 
 

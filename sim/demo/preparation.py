@@ -87,8 +87,8 @@ def make_plan(
     except OSError as error:
         remedy = "set --web-host to an address of this machine, or 0.0.0.0 for all of them"
         raise DemoError(f"cannot serve the page on {web_host} ({error.strerror}); {remedy}") from error
-    # The ports must be free on every address, because page and robots may use different addresses; the requested port
-    # is excluded.
+    # The ports must be free on every address, because page and robots may use different addresses.  The port that the
+    # operator requested is not used for another purpose.
     found = free_ports.find_free_ports("tcp", ANY_ADDRESS, 1 + SERVER_PORTS + MAX_PORTS * len(DOGS))
     spare = iter([one for one in found if one != web_port])
     if web_port:

@@ -11,7 +11,7 @@ from middleware.deployment import module_channel
 
 
 class Loopback:
-    """A conversation with a behaviour; replies arrive immediately, unless ``is_held`` keeps them until ``let``."""
+    """A conversation with a behaviour; replies arrive immediately, or on ``let`` while ``is_held`` is set."""
 
     def __init__(self, make: Factory, parameters: Mapping[str, Any] | None = None) -> None:
         self.fault = ""

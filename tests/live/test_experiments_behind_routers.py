@@ -39,7 +39,7 @@ class ExperimentsBehindRoutersTests(NamespaceCase):
         verdicts = json.loads(report.read_text())
         self.assertIn("takeover", json.dumps(verdicts))
         self.assertEqual(ran.stdout.count("PASS"), 2, ran.stdout)
-        # The page was requested without TLS, which shows that plain text would be found.
+        # The page was requested without TLS and its words are in the capture, so the search finds plain text.
         self.assertEqual(find_words(record.read_bytes(), WORDS), list(WORDS))
         datagrams = [held for _, _, held in datagrams_of(record)]
         self.assertGreater(len(datagrams), 500)

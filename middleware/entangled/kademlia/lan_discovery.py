@@ -202,7 +202,7 @@ class LanDiscovery:
         self._background.later(self._rng.random() * MAX_REPLY_DELAY_S, self._answer, datagram, source)
 
     def _answer(self, datagram: bytes, source: Address) -> None:
-        """Reply to a DISCOVERY, or leave the reply to other nodes; simultaneous senders have been counted by now."""
+        """Reply to a DISCOVERY with a probability that falls with the number of nodes that can reply or also ask."""
         self._pending -= 1
         since = self._clock.seconds() - RECENT_S
         callers = sum(1 for moment in self._multicast_times if moment > since)

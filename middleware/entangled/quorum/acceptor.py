@@ -312,7 +312,7 @@ class Acceptor(Generic[Key]):
         event, ballot, now, configuration, token, _, gives_back = request
         lives = self.log.codec.lives
         left = register.lease_until - now
-        is_own = ballot.is_same_life(register.holder, lives)  # L2: its earlier process is a different holder
+        is_own = ballot.is_same_life(register.holder, lives)  # L2: after a restart a node is another holder than before
         is_held = left > 0.0 and not is_own and not register.is_released
         if event is Event.RELEASE:
             if not (is_own or ballot.is_same_life(register.promised, lives)):

@@ -32,7 +32,7 @@ class ReplyKind(Enum):
 
 
 class Reply(NamedTuple):
-    """The reply of an acceptor; ``remaining`` counts from the time of the reply.
+    """The reply of an acceptor; ``remaining`` is a number of seconds after the reply.
 
     ``promised`` is the highest promised ballot, ``token`` the highest granted token; ``value`` was accepted under the
     ballot ``accepted``.  ``proof`` is the certificate of the configuration in a ``MOVED`` reply, or a signature of the

@@ -139,7 +139,7 @@ class SizeMeasurement:
         team = Team(self._scenario, settings.seed)
         team.switchboard.link_model = RadioLink(LinkQuality(DELAY_S, JITTER_S, settings.loss))
         bidding = Auctions(team, AuctionSettings(count=settings.auctions, every=4.0))
-        # At this rate, no more nodes are away at the same time than a small team tolerates.
+        # This rate is low enough that a small team tolerates the number of nodes that are away at the same time.
         rate = min(5.0, max(0.12, nodes / 200))
         dying = Takeovers(team, TakeoverSettings(count=settings.takeovers, rate=rate, away=AWAY_S))
         self._say("nodes join for a task")
