@@ -57,7 +57,7 @@ class PositionTests(PageCase):
             one, two = self.centres(page, "dog1", "dog2")
             # 22.3 m to the east and 11.1 m to the north
             self.assertLess(abs((two[0] - one[0]) / (one[1] - two[1]) - (22.3 / 11.13)), 0.1)
-            self.assertIn("48.13710°, 11.57540°, to 8.0 m", page.locator(".places").inner_text())
+            self.assertIn("48.13710°, 11.57540°, ± 8.0 m", page.locator(".places").inner_text())
             self.assertIn("dog3 1.00, 1.00 m", page.locator(".places").inner_text())
             self.tab_to(page, ".spot[aria-label^=dog2]")
             page.keyboard.press("Enter")
