@@ -28,7 +28,7 @@ from swarmnode.plugin import Options
 from swarmnode.simulation import main as sim
 from tests.test_docs import DOCUMENTS, ROOT
 
-LANGUAGES = {"sh", "text", "toml", "python", "json", "mermaid", "yaml", "ini", "javascript", "bash", "nginx"}
+LANGUAGES = {"sh", "text", "toml", "python", "mermaid", "yaml", "ini", "nginx"}
 FENCE = re.compile(r"^( *)```(\{?[a-z]*)[^\n]*\n(.*?)^\1```", re.M | re.S)
 TARGETS = set(re.findall(r"^([a-z][\w-]*):", (ROOT / "Makefile").read_text(), re.M))
 VARIABLES = set(re.findall(r"^([A-Z_]+) *[?:]?=", (ROOT / "Makefile").read_text(), re.M))
@@ -125,10 +125,7 @@ def find_problems(block: Block, content: dict[str, Any]) -> list[str]:
         lambda: parse_simulation(
             block.text, "team.toml", "team", {name: kind.settings for name, kind in KINDS.items()}
         ),
-        *(
-            partial(Settings.from_mapping, {**named, table: {**named.get(table, {}), **content}}, "node.toml")
-            for table in TABLES
-        ),
+        *(partial(Settings.from_mapping, merge_tables(named, {table: content}), "node.toml") for table in TABLES),
     ]
     problems = []
     for read in readers:
