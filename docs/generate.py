@@ -29,8 +29,6 @@ API = {
 }
 """The modules that a program may import, by purpose."""
 BEGIN, END = "<!-- rows: docs/generate.py -->", "<!-- end of the rows -->"
-TEAM_VERBS = ("devices", "team roll", "team tell")
-"""The verbs of ``swarmnode.team.verb``."""
 UNPACKED_TYPES = {"Capabilities": "table of tables", "Mapping[str, float | str]": "table of numbers and texts"}
 TYPE_WORDS = {"str": "text", "int": "integer", "float": "number", "bool": "boolean", "tuple[Contact, ...]": "contacts"}
 Main = Callable[[Sequence[str]], Any]
@@ -162,9 +160,11 @@ def list_strategies() -> Rows:
 def list_verbs() -> Rows:
     """Return the verbs of the control socket, and whether each sends events."""
     from middleware.entangled.control.request_handler import RequestHandler
+    from swarmnode.team.verb import TeamVerbs
 
     node: Any = None
-    known = (*RequestHandler(node, node, node, node)._find_handlers(), *TEAM_VERBS)
+    verbs = RequestHandler(node, node, node, node)._find_handlers()
+    known = (*verbs, "devices", *TeamVerbs(node, node)._find_handlers())
     return {name: ("events" if name.endswith(" watch") else "answer",) for name in known}
 
 

@@ -26,7 +26,7 @@ from middleware.admission.statement import NAME_PATTERN, check_bytes
 from middleware.config.settings import COMMAND_LINE, NodeSettings, Settings
 from middleware.entangled.errors import EntangledError, RemoteError
 from middleware.entangled.network.interface import is_loopback
-from middleware.entangled.network.network import ANY_HOST, Address
+from middleware.entangled.network.network import ANY_HOST, Address, find_alternate_paths
 from middleware.errors import BadSetting
 from swarmnode.control_client import Rejection
 from swarmnode.team.common import Answer, CommandContext, InvalidCommand, make_parser, parse_duration, run_verb
@@ -222,7 +222,7 @@ def send_join_requests(
         ]
         client = JoinClient(code, seed, network, clock, rng, wish)
         work = client.join(mapped, timeout)
-        for address in getattr(network, "alternate_paths", ()):
+        for address in find_alternate_paths(network):
             clock.callLater(FALLBACK_AFTER_S, client.add_address, address)
 
         def failed(failure: Any) -> None:

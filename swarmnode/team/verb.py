@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from twisted.internet.defer import Deferred, maybeDeferred
@@ -34,12 +34,13 @@ class TeamVerbs:
         """Run the request ``name``, as ``RequestHandler.run`` does."""
         if name == "devices":
             return self._node.list_devices().addCallback(lambda listing: make_rows(listing.records))
-        work = {"team tell": self._publish_statement, "team roll": self._describe_team}.get(
-            name if isinstance(name, str) else ""
-        )
+        work = self._find_handlers().get(name) if isinstance(name, str) else None
         if work is None:
             return self._others.run(name, arguments, tell)
         return maybeDeferred(self._run_for_team, work, arguments)
+
+    def _find_handlers(self) -> Mapping[str, Callable[[Team, Arguments], object]]:
+        return {"team roll": self._describe_team, "team tell": self._publish_statement}
 
     def _run_for_team(self, work: Callable[[Team, Arguments], object], arguments: object) -> object:
         if not isinstance(arguments, dict):

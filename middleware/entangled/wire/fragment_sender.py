@@ -24,9 +24,8 @@ from middleware.entangled.wire.message import (
 IDLE_TIMEOUT_S = 10.0
 MAX_PARALLEL_MESSAGES = 4  # messages to one peer that are sent alternately; more wait, to limit the receiver's memory
 RECEIPT_EVERY = 4
-REORDERING_THRESHOLD = (
-    3  # after a round trip, a fragment is lost if one sent this many places later has arrived (RFC 9002, 6.1.1)
-)
+REORDERING_THRESHOLD = 3
+"""After a round trip, a fragment is lost if one sent this many places later has arrived (RFC 9002, 6.1.1)."""
 MIN_TIMEOUT_S = 0.02
 PROBE_FRAGMENTS = 2
 MAX_PROBE_TIMEOUT_S = 0.25
